@@ -1,0 +1,110 @@
+"""Readers of joint positions: npz packs with a captions file, and folders of ``.npy`` files."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from controlmm.data.clip import SPLITS, Caption, Clip
+
+CAPTIONS_FILE = "captions.jsonl"
+
+
+def read_packs(folder: Path, *, sources: Collection[str] | None = None) -> Iterator[Clip]:
+    """Clips of the npz packs in ``folder``, in the order of its ``captions.jsonl``.
+
+    Args:
+        folder: Holds ``captions.jsonl`` (one JSON object a clip with ``id``, ``file``, ``source``, ``split``, ``captions``,
+            ``caption_kinds``) and the packs it names (members ``ids``, ``offsets``, ``root``, ``rel``, ``rel_unit``).
+        sources: Read only these sources; ``None`` reads all.
+
+    Raises:
+        FileNotFoundError: If the captions file or a pack is missing.
+        ValueError: If a line or a pack is damaged, or a source does not occur.
+    """
+    records = _read_records(folder / CAPTIONS_FILE)
+    known = {record["source"] for record in records}
+    if sources is not None and not set(sources) <= known:
+        unknown = sorted(set(sources) - known)
+        raise ValueError(f"{folder} has no source {', '.join(unknown)}. It has: {', '.join(sorted(known))}.")
+    packs: dict[str, _Pack] = {}
+    for record in records:
+        if sources is not None and record["source"] not in sources:
+            continue
+        name = record["file"]
+        if name not in packs:
+            packs[name] = _Pack(folder / name)
+        captions = tuple(
+            Caption(text, kind) for text, kind in zip(record["captions"], record["caption_kinds"], strict=True)
+        )
+        yield Clip(
+            record["id"], packs[name].joints(record["id"]), captions, record["source"], record["licence"], record["split"]
+        )
+
+
+def read_joint_folder(folder: Path) -> Iterator[Clip]:
+    """Clips of a folder of ``NAME.npy`` joint positions (F, 22, 3), with captions in ``NAME.txt`` where there are any.
+
+    A sentence a line; all clips are of split ``train`` unless ``val.txt`` or ``test.txt`` beside them list the name.
+
+    Raises:
+        FileNotFoundError: If the folder does not exist or holds no ``.npy`` file.
+        ValueError: If a file is damaged.
+    """
+    files = sorted(folder.glob("*.npy")) if folder.is_dir() else []
+    if not files:
+        raise FileNotFoundError(f"No .npy files of joint positions in {folder}.")
+    split_of = {name: split for split in SPLITS for name in _lines(folder / f"{split}.txt")}
+    for file in files:
+        try:
+            joints = torch.from_numpy(np.load(file, allow_pickle=False))
+        except (ValueError, EOFError, OSError, TypeError) as error:
+            raise ValueError(f"{file} is not a readable .npy file: {error}") from error
+        captions = tuple(Caption(line) for line in _lines(file.with_suffix(".txt")))
+        yield Clip(file.stem, joints, captions, source=folder.name, split=split_of.get(file.stem, "train"))
+
+
+class _Pack:
+    """One npz pack, every member unpacked once."""
+
+    def __init__(self, path: Path) -> None:
+        if not path.is_file():
+            raise FileNotFoundError(f"No pack at {path}.")
+        try:
+            with np.load(path, allow_pickle=False) as pack:
+                members = {name: pack[name] for name in ("ids", "offsets", "root", "rel", "rel_unit")}
+        except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise ValueError(f"{path} is not a readable motion pack: {error}") from error
+        self.index = {str(name): i for i, name in enumerate(members["ids"])}
+        self.offsets, self.root = members["offsets"], members["root"]
+        self.relative, self.unit = members["rel"], float(members["rel_unit"])
+
+    def joints(self, clip_id: str) -> torch.Tensor:
+        i = self.index[clip_id]
+        frames = slice(self.offsets[i], self.offsets[i + 1])
+        root = self.root[frames].astype(np.float64)[:, None]
+        return torch.from_numpy(np.concatenate([root, root + self.relative[frames] * self.unit], axis=1))
+
+
+def _read_records(path: Path) -> list[dict[str, Any]]:
+    if not path.is_file():
+        raise FileNotFoundError(f"No {path.name} in {path.parent}; it lists the clips and their captions.")
+    records = []
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+        try:
+            records.append(json.loads(line))
+        except json.JSONDecodeError as error:
+            raise ValueError(f"{path}, line {number}: broken JSON ({error.msg}).") from error
+    return records
+
+
+def _lines(path: Path) -> list[str]:
+    if not path.is_file():
+        return []
+    return [line.strip() for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
