@@ -79,9 +79,8 @@ class BertLayer(nn.Module):
     def forward(self, x: Float[Tensor, "B S C"], mask: Bool[Tensor, "B S"]) -> Float[Tensor, "B S C"]:
         """The next hidden states; tokens where ``mask`` is false are not attended to."""
         projections = (self.query(x), self.key(x), self.value(x))
-        q, k, v = (
-            p.unflatten(-1, (self.heads, -1)).transpose(1, 2) for p in projections
-        )  # (B, heads, S, ...)
+        # (B, S, C) -> (B, heads, S, C / heads)
+        q, k, v = (p.unflatten(-1, (self.heads, -1)).transpose(1, 2) for p in projections)
         attended = functional.scaled_dot_product_attention(q, k, v, attn_mask=mask[:, None, None, :])
         x = self.attention_norm(x + self.attention_out(attended.transpose(1, 2).flatten(2)))
         hidden: Tensor = self.output_norm(x + self.contract(functional.gelu(self.expand(x))))

@@ -24,6 +24,7 @@ from controlmm.text.encoder import TextFeatures, check_prompts, no_features
 
 VERSION = 1  # raise it when a prompt's features change
 _SHORTEST_GRAM, _LONGEST_GRAM = 3, 4
+_PAIR_WEIGHT = 0.5  # below 1, so that shared words count more than their order
 
 
 class HashingTextEncoder:
@@ -71,7 +72,9 @@ class HashingTextEncoder:
         """Pairs of neighbours make the order of the words count ("turns left then walks right")."""
         pairs = [f"pair:{first} {second}" for first, second in itertools.pairwise(words)]
         signs = [_signs(pair, self.dim) for pair in pairs]
-        return torch.stack(signs).sum(0) / self.dim**0.5 if signs else torch.zeros(self.dim)
+        if not signs:
+            return torch.zeros(self.dim)
+        return torch.stack(signs).sum(0) * (_PAIR_WEIGHT / self.dim**0.5)
 
 
 @lru_cache(maxsize=65536)

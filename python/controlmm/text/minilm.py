@@ -1,4 +1,4 @@
-"""MiniLM sentence features (all-MiniLM-L6-v2), from weights that a package carries: nothing to download later.
+"""MiniLM sentence features (all-MiniLM-L6-v2), from weights that an installed package carries.
 
 Source: Wang et al., "MiniLM", NeurIPS 2020; pooling as in Sentence-BERT (Reimers and Gurevych, EMNLP 2019).
 """
@@ -95,9 +95,7 @@ def _package_folder() -> Path:
     # Importing the package would want sentence-transformers; finding it does not.
     spec = importlib.util.find_spec(WEIGHTS_PACKAGE)
     if spec is None or spec.origin is None:
-        raise ModuleNotFoundError(
-            f"The weights of the MiniLM text encoder are missing. Run: {INSTALL_COMMAND}"
-        )
+        raise ModuleNotFoundError(f"The text encoder's weights are not installed. Run: {INSTALL_COMMAND}")
     return Path(spec.origin).parent / "model"
 
 
