@@ -1,0 +1,40 @@
+"""What a training run is told: sizes, schedule, seed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """Everything about a run but the network and the data."""
+
+    steps: int  # optimiser steps
+    batch_size: int
+    learning_rate: float = 2e-4
+    warmup: int = 2000  # steps of linear warm-up
+    milestones: tuple[int, ...] = ()  # steps at which the rate falls by `gamma`; empty: cosine decay to 1 %
+    gamma: float = 0.1
+    weight_decay: float = 0.0
+    betas: tuple[float, float] = (0.9, 0.99)
+    clip_norm: float = 1.0  # gradient norm; 0 turns clipping off, as the published training has it
+    bf16: bool = True  # autocast; float32 master weights
+    validate_every: int = 500
+    checkpoint_every: int = 250
+    seed: int = 3407
+
+    def __post_init__(self) -> None:
+        if self.steps < 1 or self.batch_size < 1 or self.validate_every < 1 or self.checkpoint_every < 1:
+            raise ValueError(f"`steps`, `batch_size` and the intervals must be at least 1, got {self}.")
+        if not self.learning_rate > 0:
+            raise ValueError(f"`learning_rate` must be positive, got {self.learning_rate}.")
+
+    def learning_rate_at(self, step: int) -> float:
+        """Rate of optimiser step ``step`` (0-based): warm-up, then milestones (published) or cosine (ours)."""
+        if step < self.warmup:
+            return self.learning_rate * (step + 2) / (self.warmup + 1)
+        if self.milestones:
+            return self.learning_rate * self.gamma ** sum(step >= milestone for milestone in self.milestones)
+        progress = (step - self.warmup) / max(1, self.steps - self.warmup)
+        return self.learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(1.0, progress))))
