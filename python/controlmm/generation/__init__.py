@@ -1,0 +1,1 @@
+"""Masked decoding, objectives and editing."""

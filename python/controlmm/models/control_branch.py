@@ -1,0 +1,160 @@
+"""Motion control model: a trainable copy of the masked transformer's trunk with zero linears (ControlNet style)."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from controlmm.models.masked_transformer import MaskedTransformer, MaskedTransformerConfig, with_text_token
+from controlmm.nn.checkpoint import PretrainedModel
+from controlmm.nn.conv import ConvEncoder
+from controlmm.nn.trunk import encoder_layers
+
+
+@dataclass(frozen=True)
+class ControlBranchConfig:
+    """Control branch beside a masked transformer of the same width and depth."""
+
+    width: int = 384
+    heads: int = 6
+    layers: int = 8
+    feedforward: int = 1024
+    dropout: float = 0.2
+    joints: tuple[int, ...] = (0, 10, 11, 15, 20, 21)  # that the control signal can name
+    has_observation_mask: bool = True  # say which targets exist; without it a zero target reads as none (published)
+    encoder_width: int = 512  # of the convolutional control encoder
+    encoder_depth: int = 3
+    downsample: int = 4
+    into_frozen_trunk: bool = True  # published code; the paper's figure feeds only the copy
+
+    def __post_init__(self) -> None:
+        if self.width % self.heads:
+            raise ValueError(f"`width` must be a multiple of `heads`, got {self.width} and {self.heads}.")
+        if not self.joints:
+            raise ValueError("`joints` must name at least one joint.")
+
+    @property
+    def signal_dim(self) -> int:
+        """Channels of the control signal."""
+        return len(self.joints) * (9 if self.has_observation_mask else 6)
+
+    @classmethod
+    def paper(cls) -> ControlBranchConfig:
+        """The published size: 21.4 M parameters, six joints."""
+        return cls(has_observation_mask=False)
+
+    @classmethod
+    def small(cls) -> ControlBranchConfig:
+        """The size that ships: any of the 22 joints."""
+        return cls(
+            width=256, heads=4, layers=6, feedforward=512, dropout=0.1, joints=tuple(range(22)), encoder_width=128
+        )
+
+    @classmethod
+    def tiny(cls) -> ControlBranchConfig:
+        """For tests."""
+        return cls(
+            width=16, heads=2, layers=2, feedforward=32, dropout=0.0, joints=tuple(range(22)), encoder_width=8,
+            encoder_depth=1,
+        )  # fmt: skip
+
+    def check_base(self, base: MaskedTransformerConfig) -> None:
+        """Raise ``ValueError`` unless the branch fits the masked transformer."""
+        mine = (self.width, self.heads, self.layers, self.feedforward)
+        theirs = (base.width, base.heads, base.layers, base.feedforward)
+        if mine != theirs:
+            raise ValueError(
+                f"The control branch has (width, heads, layers, feedforward) = {mine}, but the masked transformer "
+                f"has {theirs}; they must be equal."
+            )
+
+
+class ControlBranch(PretrainedModel):
+    """Turns control signals into residuals for every layer of the frozen masked transformer."""
+
+    config_class: ClassVar[type] = ControlBranchConfig
+    config: ControlBranchConfig
+
+    def __init__(self, config: ControlBranchConfig) -> None:
+        super().__init__(config)
+        self.encoder = ConvEncoder(
+            config.signal_dim,
+            config.width,
+            width=config.encoder_width,
+            depth=config.encoder_depth,
+            downsample=config.downsample,
+            dropout=config.dropout,
+        )
+        self.first_zero = _zero_linear(config.width)
+        self.layers = encoder_layers(
+            config.layers,
+            width=config.width,
+            heads=config.heads,
+            feedforward=config.feedforward,
+            dropout=config.dropout,
+        )
+        self.mid_zeros = nn.ModuleList(_zero_linear(config.width) for _ in range(config.layers))
+
+    @classmethod
+    def beside(cls, base: MaskedTransformer, config: ControlBranchConfig) -> ControlBranch:
+        """A fresh branch whose layers are copies of ``base``'s; it changes nothing until it is trained.
+
+        Raises:
+            ValueError: If the sizes differ.
+        """
+        config.check_base(base.config)
+        branch = cls(config)
+        branch.layers.load_state_dict(copy.deepcopy(base.layers.state_dict()))
+        return branch
+
+    def signal(
+        self,
+        targets: Float[Tensor, "B T J 3"],
+        mask: Bool[Tensor, "B T J 3"],
+        current: Float[Tensor, "B T J 3"],
+    ) -> Float[Tensor, "B T S"]:
+        """The control signal: masked (target - current), masked target, and the mask; joint-major, metres.
+
+        Args:
+            targets: Global positions to reach.
+            mask: Which coordinates are controlled.
+            current: Positions of the motion decoded from the present tokens.
+        """
+        joints = list(self.config.joints)
+        observed = mask[:, :, joints].to(current.dtype)
+        difference = torch.where(mask, targets - current, 0.0)[:, :, joints]
+        target = torch.where(mask, targets, 0.0)[:, :, joints]
+        parts = [difference, target, observed] if self.config.has_observation_mask else [difference, target]
+        return torch.cat([part.flatten(2) for part in parts], dim=-1)
+
+    def forward(
+        self,
+        base: MaskedTransformer,
+        sequence: Float[Tensor, "B S W"],
+        signal: Float[Tensor, "B T C"],
+        valid: Bool[Tensor, "B L"],
+    ) -> Float[Tensor, "B L K"]:
+        """Logits of ``base`` under control; ``sequence`` is :meth:`MaskedTransformer.sequence`'s."""
+        frames = valid.repeat_interleave(self.config.downsample, dim=1)
+        encoded = self.encoder(signal.transpose(1, 2), frames).transpose(1, 2)  # (B, L, W)
+        hint = torch.nn.functional.pad(self.first_zero(encoded), (0, 0, 1, 0))  # nothing for the text token
+        hidden = sequence + hint
+        padding = ~with_text_token(valid)
+        residuals = []
+        for layer, zero in zip(self.layers, self.mid_zeros, strict=True):
+            hidden = layer(hidden, src_key_padding_mask=padding)
+            residuals.append(zero(hidden))
+        start = sequence + hint if self.config.into_frozen_trunk else sequence
+        return base.logits(start, valid, residuals)
+
+
+def _zero_linear(width: int) -> nn.Linear:
+    linear = nn.Linear(width, width)
+    nn.init.zeros_(linear.weight)
+    nn.init.zeros_(linear.bias)
+    return linear

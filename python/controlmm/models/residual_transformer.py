@@ -1,0 +1,134 @@
+"""Residual transformer: codes of the layers so far -> codes of the next layer (MoMask, CVPR 2024)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+from torch.nn.functional import one_hot
+
+from controlmm.models.masked_transformer import with_text_token
+from controlmm.nn.checkpoint import PretrainedModel
+from controlmm.nn.trunk import encoder_layers, initialize_weights, output_head, run_layers, sinusoidal_positions
+
+
+@dataclass(frozen=True)
+class ResidualTransformerConfig:
+    """Transformer that fills in the residual layers one by one."""
+
+    codebook_size: int = 512
+    num_quantizers: int = 6  # layers of the tokenizer, the base layer included
+    token_dim: int = 512
+    width: int = 384
+    heads: int = 6
+    layers: int = 8
+    feedforward: int = 1024
+    dropout: float = 0.2
+    text_dim: int = 512
+    text_scale: float = 1.0
+    text_dropout: float = 0.2
+    max_tokens: int = 98
+
+    def __post_init__(self) -> None:
+        if self.width % self.heads:
+            raise ValueError(f"`width` must be a multiple of `heads`, got {self.width} and {self.heads}.")
+        if self.num_quantizers < 3:
+            raise ValueError(f"`num_quantizers` must be at least 3 to share tables, got {self.num_quantizers}.")
+
+    @classmethod
+    def paper(cls) -> ResidualTransformerConfig:
+        """The published size: 13.4 M parameters, CLIP text."""
+        return cls()
+
+    @classmethod
+    def small(cls) -> ResidualTransformerConfig:
+        """The size that ships: 3.0 M parameters, MiniLM text."""
+        return cls(
+            token_dim=192, width=256, heads=4, layers=4, feedforward=512, dropout=0.1, text_dim=384, text_scale=20.0
+        )
+
+    @classmethod
+    def tiny(cls) -> ResidualTransformerConfig:
+        """For tests."""
+        return cls(
+            codebook_size=32, num_quantizers=3, token_dim=16, width=16, heads=2, layers=2, feedforward=32,
+            dropout=0.0, text_dim=64,
+        )  # fmt: skip
+
+    def for_text(self, text_dim: int) -> ResidualTransformerConfig:
+        """The same sizes for another text encoder."""
+        return replace(self, text_dim=text_dim)
+
+
+class ResidualTransformer(PretrainedModel):
+    """Sequence: text token, layer token, ``L`` motion tokens (sums of code embeddings of the earlier layers).
+
+    The middle layers' tables serve as input and as output tables; the first input and last output table are their own.
+    Every table has one row more than there are codes, for PAD.
+    """
+
+    config_class: ClassVar[type] = ResidualTransformerConfig
+    config: ResidualTransformerConfig
+
+    def __init__(self, config: ResidualTransformerConfig) -> None:
+        super().__init__(config)
+        rows, shared = config.codebook_size + 1, config.num_quantizers - 2
+        self.first_table = nn.Parameter(torch.randn(1, rows, config.token_dim) * 0.02)
+        self.shared_tables = nn.Parameter(torch.randn(shared, rows, config.token_dim) * 0.02)
+        self.last_table = nn.Parameter(torch.randn(1, rows, config.token_dim) * 0.02)
+        self.token_proj = nn.Linear(config.token_dim, config.width)
+        self.text_proj = nn.Linear(config.text_dim, config.width)
+        self.layer_proj = nn.Linear(config.num_quantizers, config.width)
+        self.dropout = nn.Dropout(config.dropout)
+        self.layers = encoder_layers(
+            config.layers,
+            width=config.width,
+            heads=config.heads,
+            feedforward=config.feedforward,
+            dropout=config.dropout,
+        )
+        self.head = output_head(config.width, config.token_dim)
+        self.register_buffer(
+            "positions", sinusoidal_positions(config.max_tokens, config.width), persistent=False
+        )
+        self.apply(initialize_weights)
+
+    @property
+    def pad_id(self) -> int:
+        """Row of positions after the end of a clip."""
+        return self.config.codebook_size
+
+    def input_tables(self) -> Float[Tensor, "Q1 R E"]:
+        """Tables that embed the codes of layers 0..Q-2."""
+        return torch.cat([self.first_table, self.shared_tables])
+
+    def output_tables(self) -> Float[Tensor, "Q1 R E"]:
+        """Tables that score the codes of layers 1..Q-1."""
+        return torch.cat([self.shared_tables, self.last_table])
+
+    def history(self, ids: Int[Tensor, "B L Q"], layer: Int[Tensor, "B"]) -> Float[Tensor, "B L E"]:
+        """Sum of the embeddings of the true codes of layers ``0..layer-1``; -1 counts as PAD."""
+        tables = self.input_tables()
+        ids = torch.where(ids < 0, self.pad_id, ids)
+        embedded = torch.stack([table[ids[..., i]] for i, table in enumerate(tables)], dim=1)  # (B, Q-1, L, E)
+        earlier = torch.arange(len(tables)) < layer[:, None]
+        return (embedded * earlier[:, :, None, None]).sum(1)
+
+    def forward(
+        self,
+        history: Float[Tensor, "B L E"],
+        layer: Int[Tensor, "B"],
+        text: Float[Tensor, "B D"],
+        valid: Bool[Tensor, "B L"],
+    ) -> Float[Tensor, "B L R"]:
+        """Logits of layer ``layer`` (1..Q-1), codes and PAD."""
+        tokens = self.dropout(self.token_proj(history) + self.positions[: history.shape[1]])
+        text_token = self.text_proj(text * self.config.text_scale)[:, None]
+        layer_token = self.layer_proj(one_hot(layer, self.config.num_quantizers).to(tokens.dtype))[:, None]
+        sequence = torch.cat([text_token, layer_token, tokens], dim=1)
+        hidden = run_layers(self.layers, sequence, with_text_token(valid, 2))
+        predicted: Tensor = self.head(hidden[:, 2:])
+        return torch.einsum("ble,bre->blr", predicted, self.output_tables()[layer - 1])
