@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+import math
 import re
 from collections.abc import Sequence
 from functools import lru_cache
@@ -74,7 +75,7 @@ class HashingTextEncoder:
         signs = [_signs(pair, self.dim) for pair in pairs]
         if not signs:
             return torch.zeros(self.dim)
-        return torch.stack(signs).sum(0) * (_PAIR_WEIGHT / self.dim**0.5)
+        return torch.stack(signs).sum(0) * (_PAIR_WEIGHT / math.sqrt(self.dim))
 
 
 @lru_cache(maxsize=65536)
@@ -87,7 +88,7 @@ def _word_vector(word: str, dim: int) -> Float[Tensor, "C"]:
         for start in range(len(marked) - size + 1)
     ]
     spelling = functional.normalize(torch.stack([_signs(gram, dim) for gram in grams]).sum(0), dim=0)
-    return functional.normalize(_signs(f"word:{word}", dim) / dim**0.5 + spelling, dim=0)
+    return functional.normalize(_signs(f"word:{word}", dim) / math.sqrt(dim) + spelling, dim=0)
 
 
 def _signs(feature: str, dim: int) -> Float[Tensor, "C"]:
