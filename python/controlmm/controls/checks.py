@@ -83,8 +83,9 @@ def parse_points(values: Any, *, name: str) -> tuple[Float[Tensor, "..."], Bool[
         values = values.detach().cpu().numpy()
     try:
         cells = np.array(values, dtype=object)
-        is_free = np.frompyfunc(lambda cell: cell is None, 1, 1)(cells).astype(bool)
-        if np.frompyfunc(lambda cell: isinstance(cell, (str, bytes)), 1, 1)(cells).any():
+        is_free = np.vectorize(lambda cell: cell is None, otypes=[bool])(cells)
+        is_text = np.vectorize(lambda cell: isinstance(cell, (str, bytes)), otypes=[bool])(cells)
+        if is_text.any():  # NumPy would turn "1.5" into a number
             raise TypeError("text")
         numbers = np.where(is_free, 0.0, cells).astype(np.float64)
     except (TypeError, ValueError) as error:
@@ -92,7 +93,7 @@ def parse_points(values: Any, *, name: str) -> tuple[Float[Tensor, "..."], Bool[
             f"`{name}` must be a rectangular array of numbers (or None for a free axis)."
         ) from error
     with np.errstate(over="ignore"):  # infinity is reported by `check_finite`
-        return torch.from_numpy(numbers.astype(np.float32)), torch.from_numpy(~is_free)
+        return torch.from_numpy(numbers.astype(np.float32)), torch.as_tensor(~is_free)
 
 
 def check_finite(points: Float[Tensor, "N *D"], *, name: str, frames: Int[Tensor, " N"] | None) -> None:

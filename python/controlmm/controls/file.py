@@ -44,7 +44,7 @@ def load_controls(path: str | Path) -> ControlFile:
     try:
         return reader(path.read_bytes())
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: {error}") from error
+        raise ValueError(f"{path}: {' '.join(str(error).split())}") from error  # NumPy writes several lines
 
 
 def save_controls(file: ControlFile, path: str | Path) -> Path:
