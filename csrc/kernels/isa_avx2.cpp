@@ -1,0 +1,2 @@
+#define CONTROLMM_ISA avx2
+#include "isa_table.inl"

@@ -1,0 +1,2 @@
+#define CONTROLMM_ISA baseline
+#include "isa_table.inl"

@@ -1,0 +1,2 @@
+#define CONTROLMM_ISA neon
+#include "isa_table.inl"

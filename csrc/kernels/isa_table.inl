@@ -1,0 +1,40 @@
+// Compiled once for each instruction set. Everything is in an unnamed namespace, so that no function built with
+// newer instructions can be the copy the linker keeps for older processors.
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+#include <utility>
+
+#if defined(__x86_64__)
+#include <immintrin.h>
+#elif defined(__aarch64__)
+#include <arm_neon.h>
+#endif
+
+#include "kernel_table.h"
+
+#define CONTROLMM_TEXT_OF(name) #name
+#define CONTROLMM_TEXT(name) CONTROLMM_TEXT_OF(name)
+
+namespace controlmm {
+namespace CONTROLMM_ISA {
+namespace {
+
+#include "simd.inl"
+// simd.inl first: everything below is written in its terms.
+#include "heading.inl"
+#include "recover_joints.inl"
+#include "consistency.inl"
+
+template <class T>
+constexpr Kernels<T> kernels() {
+  return {&recover_joints<T>, &recover_joints_backward<T>, &consistency<T>, &consistency_backward<T>};
+}
+
+}  // namespace
+
+extern const KernelTable table;
+const KernelTable table = {CONTROLMM_TEXT(CONTROLMM_ISA), kernels<float>(), kernels<double>()};
+
+}  // namespace CONTROLMM_ISA
+}  // namespace controlmm

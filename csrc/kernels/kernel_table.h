@@ -1,0 +1,93 @@
+#pragma once
+
+#include <cstdint>
+
+#include "controlmm/kernels.h"
+
+namespace controlmm {
+
+/// Address of an array and the distance, in elements, between neighbours along its axes.
+template <class T>
+struct Strided3 {
+  T* data;
+  std::int64_t clip, frame, channel;
+};
+
+template <class T>
+struct Strided4 {
+  T* data;
+  std::int64_t clip, frame, joint, coord;
+};
+
+struct MotionShape {
+  std::int64_t frames, joints, dim;
+};
+
+template <class T>
+struct RecoverArgs {
+  MotionShape shape;
+  Strided3<const T> features;
+  T* joints;  // row-major
+};
+
+template <class T>
+struct RecoverBackwardArgs {
+  MotionShape shape;
+  Strided3<const T> features;
+  Strided4<const T> grad_joints;
+  Strided3<T> grad_features;
+};
+
+template <class T>
+struct ConsistencyArgs {
+  MotionShape shape;
+  Strided4<const T> joints, targets;
+  Strided4<const std::uint8_t> mask;
+  Norm norm;
+  double* sums;     // one a clip
+  double* counts;   // one a clip
+  const T* scales;  // one a clip; backward only
+  T* grad_joints;   // row-major; backward only
+};
+
+/// Half-open range of clips; a clip is never split between threads, so sums keep their order.
+struct ClipRange {
+  std::int64_t begin, end;
+};
+
+template <class T>
+struct Kernels {
+  void (*recover_joints)(const RecoverArgs<T>&, ClipRange, double* scratch);
+  void (*recover_joints_backward)(const RecoverBackwardArgs<T>&, ClipRange, double* scratch);
+  void (*consistency)(const ConsistencyArgs<T>&, ClipRange);
+  void (*consistency_backward)(const ConsistencyArgs<T>&, ClipRange);
+};
+
+struct KernelTable {
+  const char* name;
+  Kernels<float> f32;
+  Kernels<double> f64;
+
+  template <class T>
+  const Kernels<T>& of() const {
+    if constexpr (sizeof(T) == 4) {
+      return f32;
+    } else {
+      return f64;
+    }
+  }
+};
+
+constexpr std::int64_t kLanes = 16;
+
+// Internal linkage: a copy compiled for one instruction set must not be the one the linker keeps for all.
+static constexpr std::int64_t round_up_to_lanes(std::int64_t n) { return (n + kLanes - 1) / kLanes * kLanes; }
+
+/// Doubles of scratch memory that the kinematic kernels need: seven time series and four padded rows.
+static constexpr std::int64_t kinematics_scratch(const MotionShape& shape) {
+  return 7 * round_up_to_lanes(shape.frames) + 4 * (round_up_to_lanes(3 * shape.joints) + 2 * kLanes);
+}
+
+const KernelTable& active_kernels();
+
+}  // namespace controlmm
