@@ -130,7 +130,9 @@ def write_folder(
                 _write_clip(path, version, joints_to_features(placed, public_quirks=public_quirks))
                 splits.setdefault(clip.split, []).append(version.id)
                 kinds = [caption.kind for caption in clip.captions]
-                about.append({"id": version.id, "source": clip.source, "licence": clip.licence, "kinds": kinds})
+                about.append(
+                    {"id": version.id, "source": clip.source, "licence": clip.licence, "kinds": kinds}
+                )
         except ValueError as error:
             raise ValueError(f"Clip {clip.id}: {error}") from error
     for split, names in {**splits, "all": [record["id"] for record in about]}.items():

@@ -41,10 +41,16 @@ def read_packs(folder: Path, *, sources: Collection[str] | None = None) -> Itera
         if name not in packs:
             packs[name] = _Pack(folder / name)
         captions = tuple(
-            Caption(text, kind) for text, kind in zip(record["captions"], record["caption_kinds"], strict=True)
+            Caption(text, kind)
+            for text, kind in zip(record["captions"], record["caption_kinds"], strict=True)
         )
         yield Clip(
-            record["id"], packs[name].joints(record["id"]), captions, record["source"], record["licence"], record["split"]
+            record["id"],
+            packs[name].joints(record["id"]),
+            captions,
+            record["source"],
+            record["licence"],
+            record["split"],
         )
 
 

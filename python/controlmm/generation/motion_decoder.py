@@ -39,9 +39,7 @@ class MotionDecoder(nn.Module):
         """Global joint positions in metres."""
         return recover_joints(self.features(latents, frames), joints=self.normalizer.skeleton.num_joints)
 
-    def base_latents(
-        self, ids: Int[Tensor, "B L"], valid: Bool[Tensor, "B L"]
-    ) -> Float[Tensor, "B L C"]:
+    def base_latents(self, ids: Int[Tensor, "B L"], valid: Bool[Tensor, "B L"]) -> Float[Tensor, "B L C"]:
         """Base-layer codes of partly masked tokens: the mean code where the id is no code, zero in padding."""
         codes = self.tokenizer.base_codes
         is_code = (ids >= 0) & (ids < len(codes))

@@ -26,7 +26,9 @@ class ControlBranchConfig:
     feedforward: int = 1024
     dropout: float = 0.2
     joints: tuple[int, ...] = (0, 10, 11, 15, 20, 21)  # that the control signal can name
-    has_observation_mask: bool = True  # say which targets exist; without it a zero target reads as none (published)
+    has_observation_mask: bool = (
+        True  # say which targets exist; without it a zero target reads as none (published)
+    )
     encoder_width: int = 512  # of the convolutional control encoder
     encoder_depth: int = 3
     downsample: int = 4
@@ -52,7 +54,13 @@ class ControlBranchConfig:
     def small(cls) -> ControlBranchConfig:
         """The size that ships: any of the 22 joints."""
         return cls(
-            width=256, heads=4, layers=6, feedforward=512, dropout=0.1, joints=tuple(range(22)), encoder_width=128
+            width=256,
+            heads=4,
+            layers=6,
+            feedforward=512,
+            dropout=0.1,
+            joints=tuple(range(22)),
+            encoder_width=128,
         )
 
     @classmethod

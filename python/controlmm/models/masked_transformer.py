@@ -11,7 +11,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from controlmm.nn.checkpoint import PretrainedModel
-from controlmm.nn.trunk import encoder_layers, initialize_weights, output_head, run_layers, sinusoidal_positions
+from controlmm.nn.trunk import (
+    encoder_layers,
+    initialize_weights,
+    output_head,
+    run_layers,
+    sinusoidal_positions,
+)
 
 
 @dataclass(frozen=True)
@@ -43,14 +49,28 @@ class MaskedTransformerConfig:
     def small(cls) -> MaskedTransformerConfig:
         """The size that ships: 3.7 M parameters, MiniLM text."""
         return cls(
-            token_dim=192, width=256, heads=4, layers=6, feedforward=512, dropout=0.1, text_dim=384, text_scale=20.0
+            token_dim=192,
+            width=256,
+            heads=4,
+            layers=6,
+            feedforward=512,
+            dropout=0.1,
+            text_dim=384,
+            text_scale=20.0,
         )
 
     @classmethod
     def tiny(cls) -> MaskedTransformerConfig:
         """For tests."""
         return cls(
-            codebook_size=32, token_dim=16, width=16, heads=2, layers=2, feedforward=32, dropout=0.0, text_dim=64
+            codebook_size=32,
+            token_dim=16,
+            width=16,
+            heads=2,
+            layers=2,
+            feedforward=32,
+            dropout=0.0,
+            text_dim=64,
         )
 
     def for_text(self, text_dim: int) -> MaskedTransformerConfig:
@@ -111,7 +131,9 @@ class MaskedTransformer(PretrainedModel):
             ValueError: If there are more tokens than ``max_tokens``.
         """
         if embedded.shape[1] > self.config.max_tokens:
-            raise ValueError(f"At most {self.config.max_tokens} tokens are possible, got {embedded.shape[1]}.")
+            raise ValueError(
+                f"At most {self.config.max_tokens} tokens are possible, got {embedded.shape[1]}."
+            )
         tokens = self.dropout(self.token_proj(embedded) + self.positions[: embedded.shape[1]])
         text_token = self.text_proj(text * self.config.text_scale)[:, None]
         return torch.cat([text_token, tokens], dim=1)

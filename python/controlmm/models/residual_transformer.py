@@ -12,7 +12,13 @@ from torch.nn.functional import one_hot
 
 from controlmm.models.masked_transformer import with_text_token
 from controlmm.nn.checkpoint import PretrainedModel
-from controlmm.nn.trunk import encoder_layers, initialize_weights, output_head, run_layers, sinusoidal_positions
+from controlmm.nn.trunk import (
+    encoder_layers,
+    initialize_weights,
+    output_head,
+    run_layers,
+    sinusoidal_positions,
+)
 
 
 @dataclass(frozen=True)
@@ -36,7 +42,9 @@ class ResidualTransformerConfig:
         if self.width % self.heads:
             raise ValueError(f"`width` must be a multiple of `heads`, got {self.width} and {self.heads}.")
         if self.num_quantizers < 3:
-            raise ValueError(f"`num_quantizers` must be at least 3 to share tables, got {self.num_quantizers}.")
+            raise ValueError(
+                f"`num_quantizers` must be at least 3 to share tables, got {self.num_quantizers}."
+            )
 
     @classmethod
     def paper(cls) -> ResidualTransformerConfig:
@@ -47,7 +55,14 @@ class ResidualTransformerConfig:
     def small(cls) -> ResidualTransformerConfig:
         """The size that ships: 3.0 M parameters, MiniLM text."""
         return cls(
-            token_dim=192, width=256, heads=4, layers=4, feedforward=512, dropout=0.1, text_dim=384, text_scale=20.0
+            token_dim=192,
+            width=256,
+            heads=4,
+            layers=4,
+            feedforward=512,
+            dropout=0.1,
+            text_dim=384,
+            text_scale=20.0,
         )
 
     @classmethod
@@ -113,7 +128,9 @@ class ResidualTransformer(PretrainedModel):
         """Sum of the embeddings of the true codes of layers ``0..layer-1``; -1 counts as PAD."""
         tables = self.input_tables()
         ids = torch.where(ids < 0, self.pad_id, ids)
-        embedded = torch.stack([table[ids[..., i]] for i, table in enumerate(tables)], dim=1)  # (B, Q-1, L, E)
+        embedded = torch.stack(
+            [table[ids[..., i]] for i, table in enumerate(tables)], dim=1
+        )  # (B, Q-1, L, E)
         earlier = torch.arange(len(tables)) < layer[:, None]
         return (embedded * earlier[:, :, None, None]).sum(1)
 

@@ -20,13 +20,13 @@ from controlmm.motion.rotations import (
 )
 from controlmm.motion.skeleton import Skeleton, skeleton_of_joints
 
-FACING_SIGMA = 20.0  # frames; the facing direction is smoothed so that the root does not follow every hip sway
+FACING_SIGMA = (
+    20.0  # frames; the facing direction is smoothed so that the root does not follow every hip sway
+)
 _GAUSSIAN_TRUNCATE = 4.0
 
 
-def joints_to_features(
-    joints: Float[Tensor, "F J 3"], *, public_quirks: bool = True
-) -> Float[Tensor, "T D"]:
+def joints_to_features(joints: Float[Tensor, "F J 3"], *, public_quirks: bool = True) -> Float[Tensor, "T D"]:
     """Features of canonical joints: ``T = F - 1`` frames of ``D = 12 J - 1`` numbers, float32.
 
     Args:
@@ -91,14 +91,14 @@ def canonicalize(joints: Float[Tensor, "F J 3"]) -> Float[Tensor, "F J 3"]:
     across = joints[0, right_hip] - joints[0, left_hip] + joints[0, right_shoulder] - joints[0, left_shoulder]
     forward = torch.linalg.cross(joints.new_tensor([0, 1, 0]), across)
     if not forward.norm() > 0:
-        raise ValueError("Frame 0 faces nowhere: the left and right hips and shoulders coincide seen from above.")
+        raise ValueError(
+            "Frame 0 faces nowhere: the left and right hips and shoulders coincide seen from above."
+        )
     turn = quat_between((forward / forward.norm()).float(), torch.tensor([0.0, 0.0, 1.0]))
     return quat_rotate(turn, joints.float())
 
 
-def retarget(
-    joints: Float[Tensor, "F J 3"], target_offsets: Float[Tensor, "J 3"]
-) -> Float[Tensor, "F J 3"]:
+def retarget(joints: Float[Tensor, "F J 3"], target_offsets: Float[Tensor, "J 3"]) -> Float[Tensor, "F J 3"]:
     """The same motion on the reference body: bones take the target's lengths, the root path is scaled by leg length.
 
     Args:

@@ -31,7 +31,9 @@ def known_suffixes() -> tuple[str, ...]:
 def _load_format(suffix: str) -> MotionFormat:
     found = entry_points(group=FORMATS_GROUP, name=suffix)
     if not found:
-        raise ValueError(f"Unknown motion format {'.' + suffix!r}. Use one of: {', '.join(known_suffixes())}.")
+        raise ValueError(
+            f"Unknown motion format {'.' + suffix!r}. Use one of: {', '.join(known_suffixes())}."
+        )
     plugin: MotionFormat = next(iter(found)).load()
     return plugin
 

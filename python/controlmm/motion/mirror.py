@@ -26,7 +26,9 @@ _KEPT_PHRASES = (
 )  # fmt: skip
 # Phrases come first, so that "right away" is taken whole before its "right" is seen.
 _WORDS = re.compile(
-    r"(?<![\w-])(" + "|".join([*map(re.escape, _KEPT_PHRASES), *sorted(_SWAPS, key=len, reverse=True)]) + r")(?![\w])"
+    r"(?<![\w-])("
+    + "|".join([*map(re.escape, _KEPT_PHRASES), *sorted(_SWAPS, key=len, reverse=True)])
+    + r")(?![\w])"
 )
 
 

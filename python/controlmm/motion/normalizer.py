@@ -30,7 +30,9 @@ class Normalizer(nn.Module):
         super().__init__()
         skeleton_of_width(mean.shape[-1])
         if mean.ndim != 1 or mean.shape != std.shape:
-            raise ValueError(f"`mean` and `std` must both be (D,), got {tuple(mean.shape)}, {tuple(std.shape)}.")
+            raise ValueError(
+                f"`mean` and `std` must both be (D,), got {tuple(mean.shape)}, {tuple(std.shape)}."
+            )
         if not (torch.isfinite(mean).all() and torch.isfinite(std).all() and (std > 0).all()):
             raise ValueError("`mean` must be finite and `std` finite and positive in every channel.")
         self.register_buffer("mean", mean.float())
@@ -87,7 +89,9 @@ class Normalizer(nn.Module):
             raise ValueError(f"{path} holds no readable feature statistics: {error}.") from error
 
 
-def channel_statistics(clips: Iterable[Float[Tensor, "T D"]]) -> tuple[Float[Tensor, "D"], Float[Tensor, "D"]]:
+def channel_statistics(
+    clips: Iterable[Float[Tensor, "T D"]],
+) -> tuple[Float[Tensor, "D"], Float[Tensor, "D"]]:
     """Mean per channel, and standard deviation averaged inside each of the seven groups, both float64.
 
     Raises:

@@ -26,7 +26,9 @@ class Skeleton:
     parents: tuple[int, ...]  # -1 for the root
     chains: tuple[tuple[int, ...], ...]  # order matters: inverse and forward kinematics walk them in turn
     directions: tuple[tuple[int, int, int], ...]  # unit vector parent -> joint in the rest pose
-    bone_lengths: tuple[float, ...] | None  # of the reference body, in `unit`; 0 for the root; None: not published
+    bone_lengths: (
+        tuple[float, ...] | None
+    )  # of the reference body, in `unit`; 0 for the root; None: not published
     mirror: tuple[int, ...]  # joint that takes a joint's place when left and right are swapped
     facing: tuple[int, int, int, int]  # right hip, left hip, right shoulder, left shoulder
     left_foot: tuple[int, int]  # ankle, toe
@@ -75,7 +77,9 @@ class Skeleton:
         if isinstance(joint, str):
             if joint in self.joint_names:
                 return self.joint_names.index(joint)
-            raise ValueError(f"Unknown joint {joint!r}. The {self.name} skeleton has: {', '.join(self.joint_names)}.")
+            raise ValueError(
+                f"Unknown joint {joint!r}. The {self.name} skeleton has: {', '.join(self.joint_names)}."
+            )
         if not 0 <= joint < self.num_joints:
             raise ValueError(f"Joint index must be in 0..{self.num_joints - 1}, got {joint}.")
         return joint

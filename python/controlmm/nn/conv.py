@@ -20,7 +20,9 @@ class ResidualConvBlock(nn.Module):
         self.pointwise = nn.Conv1d(width, width, 1)
         self.dropout = nn.Dropout(dropout)
 
-    def forward(self, x: Float[Tensor, "B C T"], valid: Float[Tensor, "B 1 T"] | None) -> Float[Tensor, "B C T"]:
+    def forward(
+        self, x: Float[Tensor, "B C T"], valid: Float[Tensor, "B 1 T"] | None
+    ) -> Float[Tensor, "B C T"]:
         """One block; ``valid`` silences frames after the end of a clip."""
         hidden = self.pointwise(torch.relu(self.dilated(torch.relu(x))))
         return masked(x + self.dropout(hidden), valid)
@@ -33,7 +35,9 @@ class ResidualStack(nn.ModuleList):
         dilations = [_DILATION_GROWTH**level for level in reversed(range(depth))]
         super().__init__(ResidualConvBlock(width, dilation=d, dropout=dropout) for d in dilations)
 
-    def forward(self, x: Float[Tensor, "B C T"], valid: Float[Tensor, "B 1 T"] | None) -> Float[Tensor, "B C T"]:
+    def forward(
+        self, x: Float[Tensor, "B C T"], valid: Float[Tensor, "B 1 T"] | None
+    ) -> Float[Tensor, "B C T"]:
         """All blocks in turn."""
         for block in self:
             x = block(x, valid)

@@ -122,7 +122,9 @@ class ResidualQuantizer(nn.Module):
 
     def lookup(self, ids: Int[Tensor, "B L Q"]) -> Float[Tensor, "B L C"]:
         """Sum of the codes; -1 adds nothing."""
-        return torch.stack([self.lookup_layer(ids[..., layer], layer) for layer in range(ids.shape[-1])]).sum(0)
+        return torch.stack([self.lookup_layer(ids[..., layer], layer) for layer in range(ids.shape[-1])]).sum(
+            0
+        )
 
     def lookup_layer(self, ids: Int[Tensor, "B L"], layer: int) -> Float[Tensor, "B L C"]:
         """Codes of one layer; -1 gives zeros."""

@@ -31,7 +31,9 @@ def corrupt_tokens(
     lengths = valid.sum(1)
     share = torch.cos(0.5 * math.pi * torch.rand(len(ids)))
     count = (share * lengths).round().clamp(min=1)
-    order = torch.rand(ids.shape).masked_fill(~valid, 2.0).argsort(1).argsort(1)  # random rank of every position
+    order = (
+        torch.rand(ids.shape).masked_fill(~valid, 2.0).argsort(1).argsort(1)
+    )  # random rank of every position
     chosen = (order < count[:, None]) & valid
     is_random = chosen & (torch.rand(ids.shape) < _RANDOM_SHARE)
     is_masked = chosen & ~is_random & (torch.rand(ids.shape) < _MASK_SHARE)

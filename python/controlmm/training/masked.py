@@ -19,7 +19,13 @@ SETTINGS = {
     ),
     "small": TrainingSettings(steps=5000, batch_size=64, learning_rate=5e-4, warmup=300, weight_decay=0.01),
     "tiny": TrainingSettings(
-        steps=20, batch_size=8, learning_rate=1e-3, warmup=2, validate_every=10, checkpoint_every=5, bf16=False
+        steps=20,
+        batch_size=8,
+        learning_rate=1e-3,
+        warmup=2,
+        validate_every=10,
+        checkpoint_every=5,
+        bf16=False,
     ),
 }
 _VALIDATION_BATCH = 64

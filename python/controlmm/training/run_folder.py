@@ -80,9 +80,7 @@ class RunFolder:
             os.fsync(file.fileno())
         temporary.replace(self.path / CHECKPOINT_FILE)
 
-    def load_checkpoint(
-        self, model: nn.Module, optimizer: torch.optim.Optimizer
-    ) -> tuple[int, float | None]:
+    def load_checkpoint(self, model: nn.Module, optimizer: torch.optim.Optimizer) -> tuple[int, float | None]:
         """Put the state back; returns the number of steps done and the best validation value.
 
         Raises:
@@ -94,7 +92,11 @@ class RunFolder:
                 progress = json.loads(tensors.metadata()["progress"])
                 state = {name: tensors.get_tensor(name) for name in tensors.keys()}  # noqa: SIM118
             model.load_state_dict(
-                {name.removeprefix("model."): value for name, value in state.items() if name.startswith("model.")}
+                {
+                    name.removeprefix("model."): value
+                    for name, value in state.items()
+                    if name.startswith("model.")
+                }
             )
         except (SafetensorError, RuntimeError, KeyError) as error:
             reason = " ".join(str(error).split())

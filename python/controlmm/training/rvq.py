@@ -28,7 +28,13 @@ SETTINGS = {
     ),
     "small": TrainingSettings(steps=6000, batch_size=128, learning_rate=6e-4, warmup=200),
     "tiny": TrainingSettings(
-        steps=20, batch_size=8, learning_rate=1e-3, warmup=2, validate_every=10, checkpoint_every=5, bf16=False
+        steps=20,
+        batch_size=8,
+        learning_rate=1e-3,
+        warmup=2,
+        validate_every=10,
+        checkpoint_every=5,
+        bf16=False,
     ),
 }
 
@@ -64,7 +70,11 @@ class RvqRecipe:
         reconstruction = smooth_l1_loss(decoded, target)
         positions = smooth_l1_loss(decoded[..., self._positions], target[..., self._positions])
         loss = reconstruction + _POSITION_WEIGHT * positions + _COMMITMENT_WEIGHT * quantized.commitment
-        losses = {"reconstruction": reconstruction, "positions": positions, "commitment": quantized.commitment}
+        losses = {
+            "reconstruction": reconstruction,
+            "positions": positions,
+            "commitment": quantized.commitment,
+        }
         if self.joint_weight:
             joints = (self._joints(decoded) - self._joints(target)).norm(dim=-1).mean()
             losses["joints"] = joints
@@ -98,7 +108,9 @@ def reconstruction_errors(
         frames = len(clip.features) // model.config.downsample * model.config.downsample
         target = clip.features[None, :frames]
         decoded = normalizer.denormalize(model(normalizer.normalize(target))[0].float())
-        global_error = (recover_joints(decoded, joints=joints) - recover_joints(target, joints=joints)).norm(dim=-1)
+        global_error = (recover_joints(decoded, joints=joints) - recover_joints(target, joints=joints)).norm(
+            dim=-1
+        )
         local_error = (decoded - target)[..., 4 : 4 + 3 * (joints - 1)].unflatten(-1, (-1, 3)).norm(dim=-1)
         errors.append((global_error.mean().item(), local_error.mean().item()))
     mean = torch.tensor(errors).mean(0)

@@ -70,7 +70,9 @@ class TokenSampler:
         self._text = text_features
         fps = normalizer.skeleton.fps
         self._items = [
-            item for index, clip in enumerate(clips) for item in _items_of(index, clip, fps, min_frames=min_frames)
+            item
+            for index, clip in enumerate(clips)
+            for item in _items_of(index, clip, fps, min_frames=min_frames)
         ]
         if not self._items:
             raise ValueError(f"No clip has a caption and {min_frames} to {MAX_FRAMES} frames.")

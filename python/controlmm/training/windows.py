@@ -19,9 +19,9 @@ def source_weights(sources: Sequence[str], sizes: Sequence[int]) -> Float[Tensor
     totals: dict[str, float] = {}
     for source, size in zip(sources, sizes, strict=True):
         totals[source] = totals.get(source, 0.0) + size
-    return torch.tensor([
-        size * totals[source] ** (SOURCE_BALANCE - 1) for source, size in zip(sources, sizes, strict=True)
-    ])
+    return torch.tensor(
+        [size * totals[source] ** (SOURCE_BALANCE - 1) for source, size in zip(sources, sizes, strict=True)]
+    )
 
 
 class WindowSampler:

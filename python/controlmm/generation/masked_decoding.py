@@ -1,0 +1,168 @@
+"""Masked decoding: from nothing but MASK tokens to a whole motion in about ten parallel steps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from controlmm.generation.editing import Progress, edit_logits
+from controlmm.generation.motion_decoder import MotionDecoder
+from controlmm.generation.noise import ClipNoise
+from controlmm.generation.objective import ControlObjective
+from controlmm.models.control_branch import ControlBranch
+from controlmm.models.masked_transformer import MaskedTransformer
+from controlmm.models.residual_transformer import ResidualTransformer
+
+_DECIDED = 1e5  # confidence of tokens that are never masked again
+_TOP_SHARE = 0.1  # of the codes can be drawn in text-only decoding ("top-k 0.9")
+
+
+@dataclass(frozen=True)
+class DecodingRequest:
+    """A batch of clips to decode, padded to the longest."""
+
+    text: Float[Tensor, "B E"]
+    valid: Bool[Tensor, "B L"]
+    noise: ClipNoise
+    steps: int = 10
+    guidance_scale: float = 4.0
+    progress: Progress | None = None
+
+    @property
+    def lengths(self) -> list[int]:
+        """Tokens of each clip."""
+        counts: list[int] = self.valid.sum(1).tolist()
+        return counts
+
+    def gumbel(self, width: int) -> Float[Tensor, "B L K"]:
+        """Fresh noise for every token of every clip."""
+        return self.noise.gumbel(self.lengths, padded=self.valid.shape[1], width=width)
+
+    def report(self, step: int) -> None:
+        """Tell the caller that ``step`` steps are done."""
+        if self.progress is not None:
+            self.progress("masked decoding", step, self.steps)
+
+
+def decode_from_text(base: MaskedTransformer, request: DecodingRequest) -> Int[Tensor, "B L"]:
+    """Base tokens of motions that follow a text only (MoMask's loop); -1 in padding."""
+    valid = request.valid
+    ids = torch.where(valid, base.mask_id, base.pad_id)
+    scores = torch.zeros(valid.shape).masked_fill(~valid, _DECIDED)
+    for step in range(request.steps):
+        hidden = lowest(scores, masked_counts(request, step))
+        ids = torch.where(hidden, base.mask_id, ids)
+        embedded = base.embed(ids)
+        logits = guided(lambda text, e=embedded: base(e, text, valid), request)
+        kept = logits.topk(math.ceil(_TOP_SHARE * logits.shape[-1]), dim=-1).indices
+        allowed = torch.full_like(logits, -math.inf).scatter(-1, kept, logits.gather(-1, kept))
+        drawn = (allowed + request.gumbel(logits.shape[-1])).argmax(-1)
+        ids = torch.where(hidden, drawn, ids)
+        confidence = logits.softmax(-1).gather(-1, drawn[..., None]).squeeze(-1)
+        scores = torch.where(hidden, confidence, _DECIDED)
+        request.report(step + 1)
+    return torch.where(valid, ids, -1)
+
+
+def decode_with_control(
+    base: MaskedTransformer,
+    branch: ControlBranch,
+    decoder: MotionDecoder,
+    objective: ControlObjective,
+    request: DecodingRequest,
+    *,
+    logits_iterations: int = 0,
+) -> Float[Tensor, "B L K"]:
+    """Final base logits of motions that follow a text and spatial targets.
+
+    Unlike without control, tokens stay soft: every step predicts all of them anew, and the motion comes from the last
+    logits, not from the ids that were drawn on the way. Those only decide where MASK is put back.
+    """
+    valid, codes = request.valid, decoder.tokenizer.base_codes
+    keep = valid[..., None].float()
+    frames = valid.repeat_interleave(decoder.downsample, dim=1)
+    mask_embedding, mean_code = base.token_embedding.weight[base.mask_id], codes.mean(0)
+    logits = torch.ones(*valid.shape, len(codes))
+    embedded = mask_embedding.expand(*valid.shape, -1)
+    scores = torch.zeros(valid.shape).masked_fill(~valid, _DECIDED)
+    for step in range(request.steps):
+        hidden = lowest(scores, masked_counts(request, step))[..., None]
+        embedded = torch.where(hidden, mask_embedding, embedded)
+        latents = torch.where(hidden, mean_code, logits.softmax(-1) @ codes) * keep
+        signal = branch.signal(objective.targets, objective.mask, decoder(latents, frames))
+        logits = guided(
+            lambda text, e=embedded, s=signal: branch(base, base.sequence(e, text), s, valid), request
+        )
+        if logits_iterations:
+            logits = edit_logits(
+                logits,
+                objective,
+                codes,
+                iterations=logits_iterations,
+                noise=lambda: request.gumbel(len(codes)),
+                keep=keep,
+            )
+        probabilities = (logits + request.gumbel(len(codes))).softmax(-1)
+        embedded = base.embed_soft(probabilities)
+        drawn = (probabilities.log() + request.gumbel(len(codes))).argmax(-1)
+        confidence = logits.softmax(-1).gather(-1, drawn[..., None]).squeeze(-1)
+        scores = torch.where(hidden[..., 0], confidence, _DECIDED)
+        request.report(step + 1)
+    return logits
+
+
+def fill_residual_layers(
+    residual: ResidualTransformer,
+    base_ids: Int[Tensor, "B L"],
+    request: DecodingRequest,
+    *,
+    guidance_scale: float = 5.0,
+) -> Int[Tensor, "B L Q"]:
+    """All layers of codes, the most likely one in each residual layer; -1 in padding."""
+    layers = [base_ids]
+    for layer in range(1, residual.config.num_quantizers):
+        number = torch.full((len(base_ids),), layer)
+        missing = torch.full_like(base_ids, -1)
+        ids = torch.stack(layers + [missing] * (residual.config.num_quantizers - layer), dim=-1)
+        history = residual.history(ids, number)
+        logits = guided(
+            lambda text, h=history, n=number: residual(h, n, text, request.valid),
+            request,
+            scale=guidance_scale,
+        )
+        drawn = logits[..., : residual.pad_id].argmax(-1)  # a valid position always has a code
+        layers.append(torch.where(request.valid, drawn, -1))
+    return torch.stack(layers, dim=-1)
+
+
+def guided(
+    predict: Callable[[Float[Tensor, "B E"]], Float[Tensor, "B L K"]],
+    request: DecodingRequest,
+    *,
+    scale: float | None = None,
+) -> Float[Tensor, "B L K"]:
+    """Classifier-free guidance: ``l_0 + s (l_text - l_0)``, where "no text" is the zero vector."""
+    scale = request.guidance_scale if scale is None else scale
+    with_text = predict(request.text)
+    if scale == 1:
+        return with_text
+    without = predict(torch.zeros_like(request.text))
+    return without + scale * (with_text - without)
+
+
+def masked_counts(request: DecodingRequest, step: int) -> Int[Tensor, "B"]:
+    """Tokens to hide in ``step``: ``max(1, round(cos(pi t / 2) length))`` with t from 0 to 1, both ends included."""
+    t = step / max(1, request.steps - 1)
+    counts = (math.cos(0.5 * math.pi * t) * request.valid.sum(1)).round().long()
+    return counts.clamp(min=1)
+
+
+def lowest(scores: Float[Tensor, "B L"], counts: Int[Tensor, "B"]) -> Bool[Tensor, "B L"]:
+    """True at the ``counts[b]`` lowest scores of each clip; equal scores go by position."""
+    rank = scores.argsort(dim=1, stable=True).argsort(dim=1, stable=True)
+    return rank < counts[:, None]

@@ -1,0 +1,68 @@
+"""A pipeline on disk: one folder a network, statistics, and what text encoder it was trained with."""
+
+from __future__ import annotations
+
+import json
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+PIPELINE_FILE, TEXT_ENCODER_FILE = "pipeline.json", "text_encoder.json"
+NORMALIZER_FILE = "normalizer.safetensors"
+FORMAT = 1
+SHIPPED = "small"  # the model in the wheel
+
+
+def shipped_folder(name: str = SHIPPED) -> Path:
+    """Folder of the trained model that comes with the package."""
+    return Path(str(resources.files("controlmm"))) / "pretrained" / name
+
+
+def resolve_folder(path: str | Path | None) -> Path:
+    """The folder to load: ``path``, or the shipped model for ``None``.
+
+    Raises:
+        FileNotFoundError: If there is no such folder, or it holds no pipeline.
+    """
+    folder = shipped_folder() if path is None else Path(path)
+    if not folder.is_dir():
+        raise FileNotFoundError(f"No model folder at {folder}. Pass a folder written by `save_pretrained`.")
+    if not (folder / PIPELINE_FILE).is_file():
+        raise FileNotFoundError(
+            f"{folder} holds no pipeline: {PIPELINE_FILE} is missing. Train one with `controlmm train` and put it "
+            "together with `controlmm assemble`."
+        )
+    return folder
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is broken or no object.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"No {path.name} in {path.parent}.")
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path} is broken JSON: {error}.") from error
+    if not isinstance(value, dict):
+        raise ValueError(f"{path} must hold a JSON object, got {type(value).__name__}.")
+    return value
+
+
+def check_kind(folder: Path, kind: str) -> None:
+    """Raise ``ValueError`` unless ``folder`` holds a pipeline of ``kind`` in a format that this version reads."""
+    about = read_json(folder / PIPELINE_FILE)
+    if about.get("kind") != kind or about.get("format") != FORMAT:
+        raise ValueError(
+            f"{folder} holds a pipeline of kind {about.get('kind')!r}, format {about.get('format')!r}; expected "
+            f"{kind!r}, format {FORMAT}."
+        )
+
+
+def write_json(path: Path, value: dict[str, Any]) -> None:
+    """Write a JSON object, indented."""
+    path.write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")

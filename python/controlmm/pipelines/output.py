@@ -1,0 +1,43 @@
+"""What a pipeline returns."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+from controlmm.motion.motion import Motion
+
+
+@dataclass(frozen=True, eq=False)
+class GenerationResult:
+    """The samples of one call.
+
+    Attributes:
+        motions: One :class:`Motion` a sample, in the order of the seeds.
+        control_error: (S,) mean distance of the controlled joints to their targets, metres, measured on the motions as
+            returned; 0 without controls.
+        latents: (S, L, C) code-space latents that decode to the motions.
+        seconds_taken: Wall-clock seconds of the call.
+    """
+
+    motions: tuple[Motion, ...]
+    control_error: Float[Tensor, "S"]
+    latents: Float[Tensor, "S L C"]
+    seconds_taken: float
+
+    @property
+    def best(self) -> Motion:
+        """The sample with the smallest control error (the first one without controls)."""
+        return self.motions[int(self.control_error.argmin())]
+
+    def __len__(self) -> int:
+        return len(self.motions)
+
+    def __iter__(self) -> Iterator[Motion]:
+        return iter(self.motions)
+
+    def __getitem__(self, index: int) -> Motion:
+        return self.motions[index]
