@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -44,7 +45,7 @@ class MotionFolder:
         return listing.read_text(encoding="utf-8").split()
 
     def clips(self, split: str, *, progress: bool = False) -> Iterator[FeatureClip]:
-        """The clips of ``split`` in the order of its list. Clips with NaN features are left out, as everywhere.
+        """The clips of ``split`` in the order of its list, without those whose features hold NaN.
 
         Raises:
             FileNotFoundError: If the list is missing.
@@ -72,7 +73,7 @@ class MotionFolder:
         kinds = kinds or ["annotator"] * len(lines)
         return tuple(parse_caption(line, kind) for line, kind in zip(lines, kinds, strict=True))
 
-    def _read_about(self) -> dict[str, dict]:  # type: ignore[type-arg]
+    def _read_about(self) -> dict[str, dict[str, Any]]:
         file = self.path / CLIPS_FILE
         if not file.is_file():
             return {}
@@ -81,7 +82,7 @@ class MotionFolder:
 
 
 def parse_caption(line: str, kind: str = "annotator") -> Caption:
-    """A line of a HumanML3D text file: ``sentence#word/TAG ...#start#end``; missing or NaN times mean the whole clip."""
+    """A line ``sentence#word/TAG ...#start#end`` of a text file; no or NaN times mean the whole clip."""
     text, *rest = line.split("#")
     times = []
     for value in rest[1:3]:

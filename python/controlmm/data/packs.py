@@ -20,8 +20,9 @@ def read_packs(folder: Path, *, sources: Collection[str] | None = None) -> Itera
     """Clips of the npz packs in ``folder``, in the order of its ``captions.jsonl``.
 
     Args:
-        folder: Holds ``captions.jsonl`` (one JSON object a clip with ``id``, ``file``, ``source``, ``split``, ``captions``,
-            ``caption_kinds``) and the packs it names (members ``ids``, ``offsets``, ``root``, ``rel``, ``rel_unit``).
+        folder: Holds ``captions.jsonl`` (one JSON object a clip with ``id``, ``file``, ``source``, ``split``,
+            ``captions``, ``caption_kinds``) and the packs it names (members ``ids``, ``offsets``, ``root``,
+            ``rel``, ``rel_unit``).
         sources: Read only these sources; ``None`` reads all.
 
     Raises:
@@ -55,9 +56,10 @@ def read_packs(folder: Path, *, sources: Collection[str] | None = None) -> Itera
 
 
 def read_joint_folder(folder: Path) -> Iterator[Clip]:
-    """Clips of a folder of ``NAME.npy`` joint positions (F, 22, 3), with captions in ``NAME.txt`` where there are any.
+    """Clips of a folder of ``NAME.npy`` joint positions (F, 22, 3), with captions in ``NAME.txt``.
 
-    A sentence a line; all clips are of split ``train`` unless ``val.txt`` or ``test.txt`` beside them list the name.
+    A sentence a line; captions may be missing. All clips are of split ``train`` unless ``val.txt`` or
+    ``test.txt`` beside them list the name.
 
     Raises:
         FileNotFoundError: If the folder does not exist or holds no ``.npy`` file.

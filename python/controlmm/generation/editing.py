@@ -1,4 +1,4 @@
-"""Editing by gradient: logits inside the decoding steps, codebook latents at the end (ControlMM section 3.4)."""
+"""Editing by gradient: logits inside the decoding steps, latents at the end (ControlMM section 3.4)."""
 
 from __future__ import annotations
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -57,8 +58,7 @@ def decode_from_text(base: MaskedTransformer, request: DecodingRequest) -> Int[T
     for step in range(request.steps):
         hidden = lowest(scores, masked_counts(request, step))
         ids = torch.where(hidden, base.mask_id, ids)
-        embedded = base.embed(ids)
-        logits = guided(lambda text, e=embedded: base(e, text, valid), request)
+        logits = guided(partial(base, base.embed(ids), valid=valid), request)
         kept = logits.topk(math.ceil(_TOP_SHARE * logits.shape[-1]), dim=-1).indices
         allowed = torch.full_like(logits, -math.inf).scatter(-1, kept, logits.gather(-1, kept))
         drawn = (allowed + request.gumbel(logits.shape[-1])).argmax(-1)
@@ -80,8 +80,8 @@ def decode_with_control(
 ) -> Float[Tensor, "B L K"]:
     """Final base logits of motions that follow a text and spatial targets.
 
-    Unlike without control, tokens stay soft: every step predicts all of them anew, and the motion comes from the last
-    logits, not from the ids that were drawn on the way. Those only decide where MASK is put back.
+    Unlike without control, tokens stay soft: every step predicts all of them anew, and the motion comes from
+    the last logits, not from the ids that were drawn on the way. Those only decide where MASK is put back.
     """
     valid, codes = request.valid, decoder.tokenizer.base_codes
     keep = valid[..., None].float()
@@ -95,9 +95,8 @@ def decode_with_control(
         embedded = torch.where(hidden, mask_embedding, embedded)
         latents = torch.where(hidden, mean_code, logits.softmax(-1) @ codes) * keep
         signal = branch.signal(objective.targets, objective.mask, decoder(latents, frames))
-        logits = guided(
-            lambda text, e=embedded, s=signal: branch(base, base.sequence(e, text), s, valid), request
-        )
+        predict = partial(_controlled_logits, base, branch, embedded, signal, valid)
+        logits = guided(predict, request)
         if logits_iterations:
             logits = edit_logits(
                 logits,
@@ -116,6 +115,18 @@ def decode_with_control(
     return logits
 
 
+def _controlled_logits(
+    base: MaskedTransformer,
+    branch: ControlBranch,
+    embedded: Float[Tensor, "B L E"],
+    signal: Float[Tensor, "B T S"],
+    valid: Bool[Tensor, "B L"],
+    text: Float[Tensor, "B D"],
+) -> Float[Tensor, "B L K"]:
+    logits: Tensor = branch(base, base.sequence(embedded, text), signal, valid)
+    return logits
+
+
 def fill_residual_layers(
     residual: ResidualTransformer,
     base_ids: Int[Tensor, "B L"],
@@ -130,11 +141,8 @@ def fill_residual_layers(
         missing = torch.full_like(base_ids, -1)
         ids = torch.stack(layers + [missing] * (residual.config.num_quantizers - layer), dim=-1)
         history = residual.history(ids, number)
-        logits = guided(
-            lambda text, h=history, n=number: residual(h, n, text, request.valid),
-            request,
-            scale=guidance_scale,
-        )
+        predict = partial(residual, history, number, valid=request.valid)
+        logits = guided(predict, request, scale=guidance_scale)
         drawn = logits[..., : residual.pad_id].argmax(-1)  # a valid position always has a code
         layers.append(torch.where(request.valid, drawn, -1))
     return torch.stack(layers, dim=-1)
@@ -156,7 +164,7 @@ def guided(
 
 
 def masked_counts(request: DecodingRequest, step: int) -> Int[Tensor, "B"]:
-    """Tokens to hide in ``step``: ``max(1, round(cos(pi t / 2) length))`` with t from 0 to 1, both ends included."""
+    """Tokens to hide in ``step``: ``max(1, round(cos(pi t / 2) length))``, t from 0 to 1 inclusive."""
     t = step / max(1, request.steps - 1)
     counts = (math.cos(0.5 * math.pi * t) * request.valid.sum(1)).round().long()
     return counts.clamp(min=1)

@@ -13,8 +13,8 @@ from controlmm.ops import recover_joints
 class MotionDecoder(nn.Module):
     """The tokenizer's decoder, the feature statistics and the kinematics in one, weights frozen.
 
-    Latents are sums of code vectors, (B, L, C). ``frames`` (B, T) marks the frames of each clip, so that a clip's motion
-    does not depend on the padding of its batch.
+    Latents are sums of code vectors, (B, L, C). ``frames`` (B, T) marks the frames of each clip, so that a
+    clip's motion does not depend on the padding of its batch.
     """
 
     def __init__(self, tokenizer: RvqVae, normalizer: Normalizer) -> None:
@@ -40,7 +40,7 @@ class MotionDecoder(nn.Module):
         return recover_joints(self.features(latents, frames), joints=self.normalizer.skeleton.num_joints)
 
     def base_latents(self, ids: Int[Tensor, "B L"], valid: Bool[Tensor, "B L"]) -> Float[Tensor, "B L C"]:
-        """Base-layer codes of partly masked tokens: the mean code where the id is no code, zero in padding."""
+        """Base codes of partly masked tokens: the mean code where the id is no code, zero in padding."""
         codes = self.tokenizer.base_codes
         is_code = (ids >= 0) & (ids < len(codes))
         looked_up = codes[ids.clamp(0, len(codes) - 1)]

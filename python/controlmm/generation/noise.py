@@ -17,7 +17,7 @@ def clip_seeds(seed: int, count: int) -> list[int]:
 
 
 class ClipNoise:
-    """One random stream for each clip, so that its motion does not depend on the clips beside it or on padding."""
+    """One random stream a clip, so that its motion does not depend on the clips beside it or on padding."""
 
     def __init__(self, seeds: Sequence[int]) -> None:
         self._generators = [torch.Generator().manual_seed(seed) for seed in seeds]

@@ -22,7 +22,7 @@ class Objective(Protocol):
 
 
 class ControlObjective:
-    """Mean squared error of the controlled coordinates in m^2, a clip at a time (MaskControl's inference loss).
+    """Mean squared error of each clip's controlled coordinates in m^2 (MaskControl's inference loss).
 
     Args:
         decoder: Latents to joints.
@@ -57,7 +57,7 @@ class ControlObjective:
 def control_error(
     joints: Float[Tensor, "B T J 3"], targets: Float[Tensor, "B T J 3"], mask: Bool[Tensor, "B T J 3"]
 ) -> Float[Tensor, "B"]:
-    """Mean distance in metres between controlled joints and their targets, over the controlled coordinates of each.
+    """Mean distance in metres of controlled joints to their targets, measured along their controlled axes.
 
     0 for a clip without targets.
     """

@@ -1,4 +1,4 @@
-"""Motion control model: a trainable copy of the masked transformer's trunk with zero linears (ControlNet style)."""
+"""Motion control model: a trainable copy of the masked trunk with zero linears (ControlNet style)."""
 
 from __future__ import annotations
 
@@ -26,9 +26,7 @@ class ControlBranchConfig:
     feedforward: int = 1024
     dropout: float = 0.2
     joints: tuple[int, ...] = (0, 10, 11, 15, 20, 21)  # that the control signal can name
-    has_observation_mask: bool = (
-        True  # say which targets exist; without it a zero target reads as none (published)
-    )
+    has_observation_mask: bool = True  # say which targets exist; published: no, a zero target reads as none
     encoder_width: int = 512  # of the convolutional control encoder
     encoder_depth: int = 3
     downsample: int = 4
@@ -67,8 +65,8 @@ class ControlBranchConfig:
     def tiny(cls) -> ControlBranchConfig:
         """For tests."""
         return cls(
-            width=16, heads=2, layers=2, feedforward=32, dropout=0.0, joints=tuple(range(22)), encoder_width=8,
-            encoder_depth=1,
+            width=16, heads=2, layers=2, feedforward=32, dropout=0.0, joints=tuple(range(22)),
+            encoder_width=8, encoder_depth=1,
         )  # fmt: skip
 
     def check_base(self, base: MaskedTransformerConfig) -> None:
@@ -77,8 +75,8 @@ class ControlBranchConfig:
         theirs = (base.width, base.heads, base.layers, base.feedforward)
         if mine != theirs:
             raise ValueError(
-                f"The control branch has (width, heads, layers, feedforward) = {mine}, but the masked transformer "
-                f"has {theirs}; they must be equal."
+                f"The control branch has (width, heads, layers, feedforward) = {mine}, but the masked "
+                f"transformer has {theirs}; they must be equal."
             )
 
 

@@ -1,4 +1,4 @@
-"""Masked transformer: text and partly masked base tokens -> logits of every base token (MoMask, CVPR 2024)."""
+"""Masked transformer: text and partly masked base tokens -> logits of all base tokens (MoMask, CVPR 2024)."""
 
 from __future__ import annotations
 
@@ -83,6 +83,7 @@ class MaskedTransformer(PretrainedModel):
 
     config_class: ClassVar[type] = MaskedTransformerConfig
     config: MaskedTransformerConfig
+    positions: Tensor
 
     def __init__(self, config: MaskedTransformerConfig) -> None:
         super().__init__(config)

@@ -81,12 +81,13 @@ class ResidualTransformerConfig:
 class ResidualTransformer(PretrainedModel):
     """Sequence: text token, layer token, ``L`` motion tokens (sums of code embeddings of the earlier layers).
 
-    The middle layers' tables serve as input and as output tables; the first input and last output table are their own.
-    Every table has one row more than there are codes, for PAD.
+    The middle layers' tables serve as input and as output tables; the first input and last output table are
+    their own. Every table has one row more than there are codes, for PAD.
     """
 
     config_class: ClassVar[type] = ResidualTransformerConfig
     config: ResidualTransformerConfig
+    positions: Tensor
 
     def __init__(self, config: ResidualTransformerConfig) -> None:
         super().__init__(config)

@@ -60,7 +60,7 @@ class RvqVaeConfig:
 
 
 class RvqVae(PretrainedModel):
-    """Features <-> tokens. Features are normalised, (B, T, D); tokens are ids (B, L, Q) or latents (B, L, C)."""
+    """Normalised features (B, T, D) <-> tokens, which are ids (B, L, Q) or latents (B, L, C)."""
 
     config_class: ClassVar[type] = RvqVaeConfig
     training_state: ClassVar[tuple[str, ...]] = ("ema_sum", "ema_count")
@@ -95,15 +95,16 @@ class RvqVae(PretrainedModel):
 
         Args:
             features: Normalised; ``T`` a multiple of ``downsample``.
-            valid: Frames that belong to each clip (a prefix, a multiple of ``downsample``); ``None`` means all. With it, a
-                clip's result does not depend on the padding.
+            valid: Frames that belong to each clip (a prefix, a multiple of ``downsample``); ``None`` means
+                all. With it, a clip's result does not depend on the padding.
 
         Raises:
             ValueError: If ``T`` is no multiple of ``downsample``.
         """
         if features.shape[1] % self.config.downsample:
             raise ValueError(
-                f"`features` must have a multiple of {self.config.downsample} frames, got {features.shape[1]}."
+                f"`features` must have a multiple of {self.config.downsample} frames, "
+                f"got {features.shape[1]}."
             )
         latents: Tensor = self.encoder(features.transpose(1, 2), valid)
         return latents.transpose(1, 2)

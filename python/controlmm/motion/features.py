@@ -1,10 +1,12 @@
 """Joint positions -> features: the HumanML3D / KIT-ML representation (Guo et al., CVPR 2022).
 
-The way back is :func:`controlmm.ops.recover_joints`. Facing directions are computed in float64, quaternions in
-float32, as the public scripts do; that is what makes released feature files agree to 1e-5.
+The way back is :func:`controlmm.ops.recover_joints`. Facing directions are computed in float64, quaternions
+in float32, as the public scripts do; that is what makes released feature files agree to 1e-5.
 """
 
 from __future__ import annotations
+
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float
@@ -20,9 +22,7 @@ from controlmm.motion.rotations import (
 )
 from controlmm.motion.skeleton import Skeleton, skeleton_of_joints
 
-FACING_SIGMA = (
-    20.0  # frames; the facing direction is smoothed so that the root does not follow every hip sway
-)
+FACING_SIGMA = 20.0  # frames; the facing is smoothed so that the root does not follow every hip sway
 _GAUSSIAN_TRUNCATE = 4.0
 
 
@@ -32,14 +32,14 @@ def joints_to_features(joints: Float[Tensor, "F J 3"], *, public_quirks: bool = 
     Args:
         joints: Global positions in metres (KIT-ML: millimetres), Y up, frame 0 at x = z = 0 and facing +Z, as
             :func:`canonicalize` returns them. 22 joints (HumanML3D) or 21 (KIT-ML).
-        public_quirks: Keep the two defects of the public scripts, which released files hold: the first frame's
-            heading is forced to +Z, so the yaw jumps by up to 40 degrees to frame 1, and the yaw velocity has the wrong
-            sign where the heading passes 180 degrees. ``False`` turns the clip so that its smoothed heading starts at
-            +Z and measures every turn rightly.
+        public_quirks: Keep the two defects of the public scripts, which released files hold: the first
+            frame's heading is forced to +Z, so the yaw jumps by up to 40 degrees to frame 1, and the yaw
+            velocity has the wrong sign where the heading passes 180 degrees. ``False`` turns the clip so that
+            its smoothed heading starts at +Z and measures every turn rightly.
 
     Raises:
-        ValueError: If the shape is wrong, there are fewer than 2 frames, or a facing direction or bone rotation is
-            undefined (coinciding hips and shoulders, a bone turned exactly by 180 degrees).
+        ValueError: If the shape is wrong, there are fewer than 2 frames, or a facing direction or bone
+            rotation is undefined (coinciding hips and shoulders, a bone turned exactly by 180 degrees).
     """
     skeleton = _checked_skeleton(joints, minimum_frames=2)
     joints = joints.double()
@@ -71,8 +71,8 @@ def joints_to_features(joints: Float[Tensor, "F J 3"], *, public_quirks: bool = 
     if not torch.isfinite(features).all():
         frame = int((~torch.isfinite(features)).any(1).nonzero()[0])
         raise ValueError(
-            f"The pose of frame {frame} has no defined rotations (coinciding joints or a bone turned by exactly 180 "
-            "degrees). Leave the clip out or move its joints a little."
+            f"The pose of frame {frame} has no defined rotations (coinciding joints or a bone turned by "
+            "exactly 180 degrees). Leave the clip out or move its joints a little."
         )
     return features
 
@@ -99,7 +99,7 @@ def canonicalize(joints: Float[Tensor, "F J 3"]) -> Float[Tensor, "F J 3"]:
 
 
 def retarget(joints: Float[Tensor, "F J 3"], target_offsets: Float[Tensor, "J 3"]) -> Float[Tensor, "F J 3"]:
-    """The same motion on the reference body: bones take the target's lengths, the root path is scaled by leg length.
+    """The same motion on the reference body: its bone lengths, and the root path scaled by leg length.
 
     Args:
         joints: Any placement and heading; the bone lengths of frame 0 count as the source body's.
@@ -128,7 +128,8 @@ def bone_lengths(joints: Float[Tensor, "F J 3"], skeleton: Skeleton) -> Float[Te
     """Distance of every joint to its parent; 0 for the root."""
     parents = list(skeleton.parents)
     parents[0] = 0
-    return (joints - joints[:, parents]).norm(dim=-1)
+    lengths: Tensor = (joints - joints[:, parents]).norm(dim=-1)
+    return lengths
 
 
 def inverse_kinematics(
@@ -142,7 +143,7 @@ def inverse_kinematics(
     rotations = heading[:, None].repeat(1, skeleton.num_joints, 1)
     for chain in skeleton.chains:
         current = heading
-        for parent, child in zip(chain[:-1], chain[1:], strict=True):
+        for parent, child in pairwise(chain):
             bone = joints[:, child] - joints[:, parent]
             bone = bone / bone.norm(dim=-1, keepdim=True)
             turned = quat_between(directions[child].expand_as(bone), bone)
@@ -161,7 +162,7 @@ def forward_kinematics(
     positions = root_path[:, None].repeat(1, skeleton.num_joints, 1)
     for chain in skeleton.chains:
         current = rotations[:, 0]
-        for parent, child in zip(chain[:-1], chain[1:], strict=True):
+        for parent, child in pairwise(chain):
             current = quat_multiply(current, rotations[:, child])
             positions[:, child] = positions[:, parent] + quat_rotate(current, offsets[child])
     return positions
@@ -192,7 +193,8 @@ def _smooth(forward: Float[Tensor, "F 3"]) -> Float[Tensor, "F 3"]:
     kernel = torch.exp(-0.5 * (offsets / FACING_SIGMA) ** 2)
     kernel = kernel / kernel.sum()
     padded = torch.cat([forward[:1].expand(radius, 3), forward, forward[-1:].expand(radius, 3)])
-    return torch.nn.functional.conv1d(padded.T[:, None], kernel[None, None])[:, 0].T
+    smoothed: Tensor = torch.nn.functional.conv1d(padded.T[:, None], kernel[None, None])
+    return smoothed[:, 0].T
 
 
 def _heading(forward: Float[Tensor, "F 3"]) -> Float[Tensor, "F 4"]:

@@ -14,9 +14,7 @@ class FeatureLayout:
     root_yaw_velocity: slice  # half the yaw change to the next frame, radians
     root_velocity: slice  # x, z displacement of the root to the next frame, in the next frame's heading
     root_height: slice  # y of the root
-    local_positions: (
-        slice  # joints 1..J-1: x, z relative to the root in the heading frame, y absolute ("ric")
-    )
+    local_positions: slice  # joints 1..J-1: x, z relative to the root in its heading, y absolute ("ric")
     local_rotations: slice  # joints 1..J-1: 6D rotations relative to the parent
     joint_velocities: slice  # joints 0..J-1: displacement to the next frame, in this frame's heading
     foot_contacts: slice  # left ankle, left toe, right ankle, right toe: 1 when at rest

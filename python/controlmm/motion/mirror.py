@@ -33,7 +33,7 @@ _WORDS = re.compile(
 
 
 def mirror_text(text: str) -> str:
-    """``text`` in lower case with left and right, clockwise and counterclockwise exchanged ("right away" stays)."""
+    """``text`` in lower case, left and right, clockwise and counterclockwise swapped ("right away" stays)."""
     return _WORDS.sub(lambda match: _SWAPS.get(match[0], match[0]), text.lower())
 
 
@@ -46,8 +46,8 @@ def mirror_joints(joints: Float[Tensor, "*T J 3"]) -> Float[Tensor, "*T J 3"]:
 def mirror_features(features: Float[Tensor, "*T D"]) -> Float[Tensor, "*T D"]:
     """De-normalised features of the reflected motion.
 
-    Exact when no retargeting follows; HumanML3D's own mirrored clips differ slightly, since its reference body is not
-    symmetric.
+    Exact when no retargeting follows; HumanML3D's own mirrored clips differ slightly, since its reference
+    body is not symmetric.
     """
     skeleton = skeleton_of_width(features.shape[-1])
     layout = feature_layout(skeleton)

@@ -80,8 +80,8 @@ class Motion:
     def save(self, path: str | Path, **options: Any) -> Path:
         """Write the motion in the format that the suffix names: npz, npy, bvh, png, gif, mp4 (and plugins).
 
-        Options belong to the format, see ``controlmm.io`` and ``controlmm.viewer``. Missing parent folders are
-        made. Returns the path.
+        Options belong to the format, see ``controlmm.io`` and ``controlmm.viewer``. Missing parent folders
+        are made. Returns the path.
 
         Raises:
             ValueError: If no format has that suffix.

@@ -12,15 +12,16 @@ from torch import Tensor, nn
 from controlmm.motion.layout import feature_layout
 from controlmm.motion.skeleton import Skeleton, skeleton_of_width
 
-# HumanML3D's option says 5, but the public scripts divide the same array twice, so every published checkpoint and
-# the evaluator carry 25.
+# HumanML3D's option says 5, but the public scripts divide the same array twice, so every published checkpoint
+# and the evaluator carry 25.
 ROOT_CONTACT_BIAS = 25.0
 
 
 class Normalizer(nn.Module):
-    """Mean and standard deviation of every feature channel; belongs to a checkpoint and never mixes with another's.
+    """Mean and standard deviation of every feature channel. They belong to one checkpoint and fit no other.
 
-    The root and contact channels weigh ``root_contact_bias`` times more, because their errors add up along the path.
+    The root and contact channels weigh ``root_contact_bias`` times more, because their errors add up along
+    the path.
     """
 
     mean: Tensor
@@ -47,7 +48,7 @@ class Normalizer(nn.Module):
     def fit(
         cls, clips: Iterable[Float[Tensor, "T D"]], *, root_contact_bias: float = ROOT_CONTACT_BIAS
     ) -> Normalizer:
-        """Statistics over all frames of ``clips`` (de-normalised features), one standard deviation for each group.
+        """Statistics over all frames of ``clips`` (de-normalised features), one standard deviation a group.
 
         Raises:
             ValueError: If there are no clips, or a group of channels never changes.

@@ -32,20 +32,22 @@ def quat_rotate(q: Float[Tensor, "*B 4"], v: Float[Tensor, "*B 3"]) -> Float[Ten
     q, v = torch.broadcast_tensors(q, torch.nn.functional.pad(v, (0, 1)))
     axis, v = q[..., 1:], v[..., :3]
     cross = torch.linalg.cross(axis, v, dim=-1)
-    return v + 2 * (q[..., :1] * cross + torch.linalg.cross(axis, cross, dim=-1))
+    turned: Tensor = v + 2 * (q[..., :1] * cross + torch.linalg.cross(axis, cross, dim=-1))
+    return turned
 
 
 def quat_between(source: Float[Tensor, "*B 3"], target: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 4"]:
     """Shortest rotation from ``source`` to ``target`` (any lengths), with ``w >= 0``.
 
-    NaN where the two are exactly antiparallel: the axis is undefined there, as in the public scripts, which skip
-    such clips.
+    NaN where the two are exactly antiparallel: the axis is undefined there, as in the public scripts, which
+    skip such clips.
     """
     source, target = torch.broadcast_tensors(source, target)
     lengths = (source.square().sum(-1, keepdim=True) * target.square().sum(-1, keepdim=True)).sqrt()
     w = lengths + (source * target).sum(-1, keepdim=True)
     q = torch.cat([w, torch.linalg.cross(source, target, dim=-1)], dim=-1)
-    return q / q.norm(dim=-1, keepdim=True)
+    unit: Tensor = q / q.norm(dim=-1, keepdim=True)
+    return unit
 
 
 def quat_to_matrix(q: Float[Tensor, "*B 4"]) -> Float[Tensor, "*B 3 3"]:
@@ -57,7 +59,8 @@ def quat_to_matrix(q: Float[Tensor, "*B 4"]) -> Float[Tensor, "*B 3 3"]:
         s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w),
         s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y),
     ]  # fmt: skip
-    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+    matrices: Tensor = torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+    return matrices
 
 
 def matrix_to_rot6d(matrix: Float[Tensor, "*B 3 3"]) -> Float[Tensor, "*B 6"]:

@@ -26,9 +26,7 @@ class Skeleton:
     parents: tuple[int, ...]  # -1 for the root
     chains: tuple[tuple[int, ...], ...]  # order matters: inverse and forward kinematics walk them in turn
     directions: tuple[tuple[int, int, int], ...]  # unit vector parent -> joint in the rest pose
-    bone_lengths: (
-        tuple[float, ...] | None
-    )  # of the reference body, in `unit`; 0 for the root; None: not published
+    bone_lengths: tuple[float, ...] | None  # of the reference body, in `unit`; None: not published
     mirror: tuple[int, ...]  # joint that takes a joint's place when left and right are swapped
     facing: tuple[int, int, int, int]  # right hip, left hip, right shoulder, left shoulder
     left_foot: tuple[int, int]  # ankle, toe
@@ -100,14 +98,16 @@ HUMANML3D = Skeleton(
         "left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist",
     ),
     parents=(-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19),
-    chains=((0, 2, 5, 8, 11), (0, 1, 4, 7, 10), (0, 3, 6, 9, 12, 15), (9, 14, 17, 19, 21), (9, 13, 16, 18, 20)),
+    chains=(
+        (0, 2, 5, 8, 11), (0, 1, 4, 7, 10), (0, 3, 6, 9, 12, 15), (9, 14, 17, 19, 21), (9, 13, 16, 18, 20),
+    ),
     directions=(
         (0, 0, 0), _X, _NEG_X, _Y, _NEG_Y, _NEG_Y, _Y, _NEG_Y, _NEG_Y, _Y, _Z, _Z, _Y, _X, _NEG_X, _Z,
         _NEG_Y, _NEG_Y, _NEG_Y, _NEG_Y, _NEG_Y, _NEG_Y,
     ),
     bone_lengths=(
-        0.0, 0.10307, 0.10988, 0.13157, 0.39362, 0.39019, 0.14319, 0.43243, 0.42564, 0.05736, 0.14338, 0.14942,
-        0.21936, 0.13749, 0.14338, 0.10304, 0.13161, 0.12298, 0.25684, 0.26309, 0.26601, 0.26988,
+        0.0, 0.10307, 0.10988, 0.13157, 0.39362, 0.39019, 0.14319, 0.43243, 0.42564, 0.05736, 0.14338,
+        0.14942, 0.21936, 0.13749, 0.14338, 0.10304, 0.13161, 0.12298, 0.25684, 0.26309, 0.26601, 0.26988,
     ),
     mirror=_mirror_of(((1, 2), (4, 5), (7, 8), (10, 11), (13, 14), (16, 17), (18, 19), (20, 21)), 22),
     facing=(2, 1, 17, 16),
@@ -159,7 +159,8 @@ def skeleton_of_width(feature_dim: int) -> Skeleton:
         if skeleton.feature_dim == feature_dim:
             return skeleton
     raise ValueError(
-        f"Features must be 263 wide (HumanML3D, 22 joints) or 251 wide (KIT-ML, 21 joints), got {feature_dim}."
+        "Features must be 263 wide (HumanML3D, 22 joints) or 251 wide (KIT-ML, 21 joints), "
+        f"got {feature_dim}."
     )
 
 

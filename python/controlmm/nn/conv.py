@@ -85,7 +85,7 @@ class ConvDecoder(nn.Module):
     def forward(
         self, x: Float[Tensor, "B C L"], valid: Bool[Tensor, "B T"] | None = None
     ) -> Float[Tensor, "B D T"]:
-        """Channel-major frames, as the last convolution emits them: the layout that the fused kernels read."""
+        """Channel-major frames, as the last convolution emits them and the fused kernels read them."""
         masks = _mask_pyramid(valid, levels=len(self.up), dtype=x.dtype)[::-1]
         x = masked(torch.relu(self.entry(masked(x, masks[0]))), masks[0])
         for stack, up, (coarse, fine) in zip(self.stacks, self.up, pairwise(masks), strict=True):
@@ -98,8 +98,8 @@ class ConvDecoder(nn.Module):
 def masked(x: Float[Tensor, "B C T"], valid: Float[Tensor, "B 1 T"] | None) -> Float[Tensor, "B C T"]:
     """``x`` with frames after a clip's end set to zero.
 
-    A convolution then sees the same zeros after a short clip as after the longest one of the batch, so a clip's
-    result does not depend on its neighbours.
+    A convolution then sees the same zeros after a short clip as after the longest one of the batch, so a
+    clip's result does not depend on its neighbours.
     """
     return x if valid is None else x * valid
 

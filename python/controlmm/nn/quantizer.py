@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -22,7 +23,7 @@ class Quantized:
 
 
 class EmaCodebook(nn.Module):
-    """``K`` codes, each the running mean of the vectors that chose it. Its whole state is in the state dict."""
+    """``K`` codes, each the running mean of the vectors that chose it; all state is in the state dict."""
 
     codes: Tensor
     ema_sum: Tensor
@@ -38,19 +39,19 @@ class EmaCodebook(nn.Module):
         self.register_buffer("is_initialized", torch.tensor(False))
 
     def nearest(self, x: Float[Tensor, "N C"], *, temperature: float = 0.0) -> Int[Tensor, "N"]:
-        """Index of the nearest code; with a temperature, a random one from softmax(-distance / temperature)."""
+        """Index of the nearest code; with a temperature, drawn from softmax(-distance / temperature)."""
         distance = x.square().sum(1, keepdim=True) - 2 * x @ self.codes.T + self.codes.square().sum(1)
         if temperature == 0:
             return distance.argmin(1)
-        # One uniform number a row and a search in the cumulated probabilities: Gumbel noise for every code gives the
-        # same distribution at a quarter of a training step's time.
+        # One uniform number a row and a search in the cumulated probabilities: Gumbel noise for every code
+        # gives the same distribution at a quarter of a training step's time.
         cumulated = torch.softmax(-distance / temperature, dim=1).cumsum(1)
         threshold = torch.rand_like(cumulated[:, :1]) * cumulated[:, -1:]
         return torch.searchsorted(cumulated, threshold).squeeze(1).clamp(max=len(self.codes) - 1)
 
     @torch.no_grad()
     def update(self, x: Float[Tensor, "N C"], ids: Int[Tensor, "N"]) -> None:
-        """Move the codes towards the vectors that chose them and give dead codes random vectors of the batch."""
+        """Move the codes towards the vectors that chose them; dead ones become random rows of ``x``."""
         num_codes = len(self.codes)
         count = torch.bincount(ids, minlength=num_codes).to(x.dtype)
         total = torch.zeros_like(self.codes).index_add_(0, ids, x)
@@ -91,8 +92,7 @@ class ResidualQuantizer(nn.Module):
 
     def book(self, layer: int) -> EmaCodebook:
         """The codebook of a layer (the only one when they are shared)."""
-        book: EmaCodebook = self.books[0 if self.is_shared else layer]
-        return book
+        return cast(EmaCodebook, self.books[0 if self.is_shared else layer])
 
     def forward(self, x: Float[Tensor, "B L C"], valid: Bool[Tensor, "B L"] | None = None) -> Quantized:
         """Quantise; in training also update the codebooks and draw the codes at random.
@@ -122,9 +122,8 @@ class ResidualQuantizer(nn.Module):
 
     def lookup(self, ids: Int[Tensor, "B L Q"]) -> Float[Tensor, "B L C"]:
         """Sum of the codes; -1 adds nothing."""
-        return torch.stack([self.lookup_layer(ids[..., layer], layer) for layer in range(ids.shape[-1])]).sum(
-            0
-        )
+        layers = [self.lookup_layer(ids[..., layer], layer) for layer in range(ids.shape[-1])]
+        return torch.stack(layers).sum(0)
 
     def lookup_layer(self, ids: Int[Tensor, "B L"], layer: int) -> Float[Tensor, "B L C"]:
         """Codes of one layer; -1 gives zeros."""

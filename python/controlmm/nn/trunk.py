@@ -30,7 +30,8 @@ def run_layers(
 ) -> Float[Tensor, "B S W"]:
     """All layers in turn; positions that are not ``valid`` are attended by nobody.
 
-    ``residuals[i]`` is added to the output of layer ``i``: that is how the control branch speaks to the frozen trunk.
+    ``residuals[i]`` is added to the output of layer ``i``: that is how the control branch speaks to the
+    frozen trunk.
     """
     padding = ~valid
     for index, layer in enumerate(layers):
@@ -56,7 +57,7 @@ def output_head(width: int, out_dim: int) -> nn.Sequential:
 
 
 def initialize_weights(module: nn.Module) -> None:
-    """Normal(0, 0.02) for linear and embedding weights, zero biases; attention keeps its Xavier in-projection."""
+    """Normal(0, 0.02) linear and embedding weights, zero biases; attention keeps its Xavier in-projection."""
     if isinstance(module, nn.Linear | nn.Embedding):
         module.weight.data.normal_(0.0, _WEIGHT_STD)
     if isinstance(module, nn.Linear) and module.bias is not None:
@@ -64,5 +65,5 @@ def initialize_weights(module: nn.Module) -> None:
 
 
 def drop_text(text: Float[Tensor, "B E"], probability: float) -> Float[Tensor, "B E"]:
-    """Text vectors with a random ``probability`` of them set to zero, the vector that stands for "no text"."""
+    """Text vectors, each with ``probability`` set to zero, the vector that stands for "no text"."""
     return text * (torch.rand(len(text), 1) >= probability)

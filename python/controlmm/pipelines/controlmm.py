@@ -1,4 +1,7 @@
-"""ControlMM: text plus 3D control in, human motion out (Pinyoanuntapong et al., ControlMM / MaskControl, ICCV 2025)."""
+"""ControlMM: text plus 3D control in, human motion out.
+
+Source: Pinyoanuntapong et al., ControlMM / MaskControl, ICCV 2025.
+"""
 
 from __future__ import annotations
 
@@ -29,6 +32,7 @@ from controlmm.models.rvq_vae import RvqVae, frame_mask
 from controlmm.motion.motion import Motion
 from controlmm.motion.normalizer import Normalizer
 from controlmm.motion.skeleton import Skeleton
+from controlmm.nn.checkpoint import PretrainedModel
 from controlmm.pipelines import folder as files
 from controlmm.pipelines.checks import check_sampling, frame_count
 from controlmm.pipelines.output import GenerationResult
@@ -65,9 +69,9 @@ class ControlMM:
                 f"`text_encoder` gives {text_encoder.dim} numbers a prompt, the transformer wants "
                 f"{transformer.config.text_dim}."
             )
-        self.transformer, self.residual, self.control = (
-            network.eval().requires_grad_(False) for network in (transformer, residual, control)
-        )
+        self.transformer = transformer.eval().requires_grad_(False)
+        self.residual = residual.eval().requires_grad_(False)
+        self.control = control.eval().requires_grad_(False)
         self.decoder = MotionDecoder(tokenizer, normalizer)
         self.text_encoder = text_encoder
 
@@ -79,11 +83,11 @@ class ControlMM:
 
         Args:
             path: A folder written by :meth:`save_pretrained`.
-            text_encoder: Use this one instead of loading the one that the folder names; it must be the same kind.
+            text_encoder: Use this one instead of loading the one that the folder names; it must equal it.
 
         Raises:
             FileNotFoundError: If the folder or one of its files is missing.
-            ValueError: If a file is damaged, or the text encoder is not the one that the model was trained with.
+            ValueError: If a file is damaged, or the text encoder is not the one used in training.
             ModuleNotFoundError: If the text encoder's weights are not installed.
         """
         folder = files.resolve_folder(path)
@@ -141,12 +145,13 @@ class ControlMM:
 
         Args:
             prompt: What the person does, in words.
-            seconds: Length, 0.4 to 9.8 s; or pass ``frames`` (8 to 196, at 20 fps). 6 s when both are missing.
+            seconds: Length, 0.4 to 9.8 s; or pass ``frames`` (8 to 196, at 20 fps). 6 s without either.
             frames: Length in frames.
-            controls: Targets in metres, Y up, ground at y = 0. The body starts facing +Z (its left is +X), at x = z = 0
-                unless a control names the pelvis at frame 0. Contradicting or impossible frames are refused.
+            controls: Targets in metres, Y up, ground at y = 0. The body starts facing +Z (its left is +X), at
+                x = z = 0 unless a control names the pelvis at frame 0. Contradicting or impossible frames are
+                refused.
             samples: How many motions; sample ``i`` is the same however many are asked for.
-            preset: ``fast``, ``balanced`` or ``accurate`` (the papers' iteration counts), or a :class:`Preset`.
+            preset: ``fast``, ``balanced``, ``accurate`` (the papers' iteration counts) or a :class:`Preset`.
             guidance_scale: How strongly the text counts; ``None`` takes the preset's.
             seed: Same seed, same motions.
             progress: Called as ``progress(phase, done, total)`` during long loops.
@@ -203,11 +208,9 @@ class ControlMM:
         targets, mask = (_padded(dense, valid.shape[1] * step) for dense in (targets, mask))
         is_controlled = mask.flatten(1).any(1)
         latents = torch.zeros(*valid.shape, self.decoder.tokenizer.config.code_dim)
-        for chosen, generate in ((~is_controlled, self._from_text), (is_controlled, self._from_control)):
-            rows = chosen.nonzero()[:, 0]
-            if not len(rows):
-                continue
-            request = DecodingRequest(
+
+        def request_for(rows: Tensor) -> DecodingRequest:
+            return DecodingRequest(
                 text[rows],
                 valid[rows],
                 ClipNoise([seeds[row] for row in rows.tolist()]),
@@ -215,10 +218,16 @@ class ControlMM:
                 guidance_scale=preset.guidance_scale,
                 progress=progress,
             )
-            latents[rows] = generate(request, targets[rows], mask[rows], preset)
+
+        free, controlled = (~is_controlled).nonzero()[:, 0], is_controlled.nonzero()[:, 0]
+        if len(free):
+            latents[free] = self._from_text(request_for(free), preset)
+        if len(controlled):
+            request = request_for(controlled)
+            latents[controlled] = self._from_control(request, targets[controlled], mask[controlled], preset)
         return latents
 
-    def _from_text(self, request: DecodingRequest, targets: Tensor, mask: Tensor, preset: Preset) -> Tensor:
+    def _from_text(self, request: DecodingRequest, preset: Preset) -> Tensor:
         base_ids = decode_from_text(self.transformer, request)
         ids = fill_residual_layers(
             self.residual, base_ids, request, guidance_scale=preset.residual_guidance_scale
@@ -261,7 +270,7 @@ class ControlMM:
         extra = {} if controls.is_empty else {"targets": controls.targets, "mask": controls.mask}
         return dataclasses.replace(motion, joints=motion.joints + origin, extra=extra)
 
-    def _networks(self) -> dict[str, nn.Module]:
+    def _networks(self) -> dict[str, PretrainedModel]:
         return {
             "tokenizer": self.decoder.tokenizer,
             "transformer": self.transformer,

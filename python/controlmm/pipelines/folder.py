@@ -29,8 +29,8 @@ def resolve_folder(path: str | Path | None) -> Path:
         raise FileNotFoundError(f"No model folder at {folder}. Pass a folder written by `save_pretrained`.")
     if not (folder / PIPELINE_FILE).is_file():
         raise FileNotFoundError(
-            f"{folder} holds no pipeline: {PIPELINE_FILE} is missing. Train one with `controlmm train` and put it "
-            "together with `controlmm assemble`."
+            f"{folder} holds no pipeline: {PIPELINE_FILE} is missing. Train one with `controlmm train` and "
+            "put it together with `controlmm assemble`."
         )
     return folder
 
@@ -54,12 +54,12 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def check_kind(folder: Path, kind: str) -> None:
-    """Raise ``ValueError`` unless ``folder`` holds a pipeline of ``kind`` in a format that this version reads."""
+    """Raise ``ValueError`` unless ``folder`` holds a pipeline of ``kind`` in a format that we read."""
     about = read_json(folder / PIPELINE_FILE)
     if about.get("kind") != kind or about.get("format") != FORMAT:
         raise ValueError(
-            f"{folder} holds a pipeline of kind {about.get('kind')!r}, format {about.get('format')!r}; expected "
-            f"{kind!r}, format {FORMAT}."
+            f"{folder} holds a pipeline of kind {about.get('kind')!r}, format {about.get('format')!r}; "
+            f"expected {kind!r}, format {FORMAT}."
         )
 
 

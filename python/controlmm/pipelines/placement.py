@@ -1,7 +1,7 @@
 """Where the canonical motion stands in the user's world.
 
-Networks work in a frame in which the pelvis starts at x = z = 0. A control that wants the pelvis elsewhere at frame 0
-therefore moves the whole scene there and back.
+Networks work in a frame in which the pelvis starts at x = z = 0. A control that wants the pelvis elsewhere at
+frame 0 therefore moves the whole scene there and back.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from controlmm.controls import DenseControls
 
 
 def start_position(controls: DenseControls) -> Float[Tensor, "3"]:
-    """Where the controls want the root at frame 0, on the ground plane; the origin where they leave it free."""
+    """Where the controls want the root at frame 0, on the ground; the origin where they leave it free."""
     wanted = controls.targets[0, 0] * controls.mask[0, 0]
     return wanted * wanted.new_tensor([1, 0, 1])
 

@@ -28,7 +28,7 @@ _VALIDATION_BATCH = 50
 
 
 class ControlRecipe:
-    """Cross-entropy of the tokens and distance of the decoded joints to the targets; base and tokenizer stay frozen."""
+    """Cross-entropy of the tokens and distance of the joints to the targets; the base model is frozen."""
 
     def __init__(
         self,
@@ -51,7 +51,7 @@ class ControlRecipe:
         return self._losses(self._train.sample(batch_size))
 
     def validate(self) -> dict[str, float]:
-        """Losses on the validation clips; ``consistency`` is the mean error of a controlled coordinate in metres."""
+        """Losses on the validation clips; ``consistency`` is the mean error of a coordinate in metres."""
         totals: dict[str, float] = {}
         for first in range(0, len(self._val), _VALIDATION_BATCH):
             indices = range(first, min(first + _VALIDATION_BATCH, len(self._val)))

@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-# Shares of the kinds of control in training. The published modes are `trajectory` and `cross` with a uniform density;
+# Shares of the kinds of control in training. The published modes are `trajectory` and `cross` with a uniform
+# density;
 # ours is heavy on sparse targets, which are what people give, and keeps a share without any control.
 _NO_CONTROL, _PATH, _TRAJECTORY, _POSE = 0.1, 0.2, 0.2, 0.1  # the rest: some joints at some frames
 
@@ -16,7 +17,7 @@ _NO_CONTROL, _PATH, _TRAJECTORY, _POSE = 0.1, 0.2, 0.2, 0.1  # the rest: some jo
 def mixed_masks(
     frames: Bool[Tensor, "B T"], *, joints: int, favoured: Sequence[int]
 ) -> Bool[Tensor, "B T J 3"]:
-    """Random control masks of all kinds: ground path, pelvis trajectory, whole poses, joints at frames, nothing.
+    """Random control masks of all kinds: ground path, pelvis trajectory, poses, joints at frames, nothing.
 
     Args:
         frames: Frames of each clip.
@@ -43,7 +44,7 @@ def mixed_masks(
 
 
 def random_frames(length: int) -> Int[Tensor, "N"]:
-    """Between 1 and ``length`` distinct frames; the number is log-uniform, so that sparse control is common."""
+    """Between 1 and ``length`` distinct frames; their number is log-uniform: sparse control is common."""
     count = int(torch.exp(torch.rand(()) * torch.tensor(float(length) + 1).log()))
     return torch.randperm(length)[: max(1, min(count, length))]
 

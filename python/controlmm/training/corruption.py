@@ -22,8 +22,8 @@ def corrupt_tokens(
 ) -> tuple[Int[Tensor, "B L"], Bool[Tensor, "B L"]]:
     """Hide a random share ``cos(pi u / 2)`` of each clip's tokens, u uniform.
 
-    The share is taken of the clip's own length; the published code takes it of the padded length, so that its short clips
-    are masked at random with less spread.
+    The share is taken of the clip's own length; the published code takes it of the padded length, so that its
+    short clips are masked at random with less spread.
 
     Returns:
         The corrupted ids (PAD outside ``valid``) and the chosen positions.

@@ -1,7 +1,7 @@
 """The training loop that every recipe shares.
 
-Every step draws all its randomness (batch, dropout, noise) from ``(seed, step)``. So a run that was killed and resumed takes
-the same steps as one that was never stopped.
+Every step draws all its randomness (batch, dropout, noise) from ``(seed, step)``. So a run that was killed
+and resumed takes the same steps as one that was never stopped.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The folder of a training run: settings, log, curves, and a checkpoint that survives a kill at any moment."""
+"""The folder of a training run: settings, log, and a checkpoint that survives a kill at any moment."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CHECKPOINT_FILE, LOG_FILE, SETTINGS_FILE = "checkpoint.safetensors", "metrics.js
 
 
 class RunFolder:
-    """Reads and writes one run. Every file is replaced in one step, so that it is whole or old, never half."""
+    """Reads and writes one run. Files are replaced in one step, so that each is whole or old, never half."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)

@@ -42,8 +42,8 @@ SETTINGS = {
 class RvqRecipe:
     """Smooth-L1 reconstruction, a second time on joint positions, commitment, and global joints in metres.
 
-    The last term is ours (weight 0 gives the published loss): errors of the root velocity add up along the path, and
-    only the recovered joints show it.
+    The last term is ours (weight 0 gives the published loss): errors of the root velocity add up along the
+    path, and only the recovered joints show it.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class RvqRecipe:
         return {"loss": loss, "perplexity": quantized.perplexity, **losses}
 
     def validate(self) -> dict[str, float]:
-        """Joint errors in metres over whole clips, global and relative to the root; their sum is the score."""
+        """Joint errors over whole clips, see :func:`reconstruction_errors`."""
         return reconstruction_errors(self.model, self.normalizer, self._val_clips)
 
     def describe(self) -> dict[str, Any]:
@@ -99,8 +99,8 @@ def reconstruction_errors(
 ) -> dict[str, float]:
     """Mean joint position error of encode -> quantise -> decode over whole clips (each cut to whole tokens).
 
-    Returns ``global`` and ``local`` (relative to the root, turned into its heading) in metres, averaged over frames and joints, then clips, and
-    ``score``, the local error plus a tenth of the global one.
+    Returns ``global`` and ``local`` (relative to the root, turned into its heading) in metres, averaged over
+    frames and joints, then clips, and ``score``, the local error plus a tenth of the global one.
     """
     errors = []
     joints = normalizer.skeleton.num_joints

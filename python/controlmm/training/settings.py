@@ -31,7 +31,7 @@ class TrainingSettings:
             raise ValueError(f"`learning_rate` must be positive, got {self.learning_rate}.")
 
     def learning_rate_at(self, step: int) -> float:
-        """Rate of optimiser step ``step`` (0-based): warm-up, then milestones (published) or cosine (ours)."""
+        """Rate of step ``step`` (0-based): warm-up, then milestones (published) or cosine decay (ours)."""
         if step < self.warmup:
             return self.learning_rate * (step + 2) / (self.warmup + 1)
         if self.milestones:

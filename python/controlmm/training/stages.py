@@ -1,4 +1,4 @@
-"""The four stages of ControlMM's training, each a run folder below one root: rvq, masked, residual, control."""
+"""The four stages of ControlMM's training, each a run folder below one root."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from controlmm.motion.normalizer import Normalizer
 from controlmm.text import TextEncoder, encode_all
 from controlmm.training import control, masked, residual, rvq
 from controlmm.training.loop import Recipe, train
-from controlmm.training.settings import TrainingSettings
 from controlmm.training.tokens import MIN_FRAMES, TokenSampler
 
 STAGES = ("rvq", "masked", "residual", "control")
@@ -52,10 +51,11 @@ def train_stage(
     changes: dict[str, Any] | None = None,
     progress: bool = True,
 ) -> Path:
-    """Train one stage into ``root/<stage>``; goes on where an earlier call was stopped. Returns the run folder.
+    """Train one stage into ``root/<stage>`` or go on where it was stopped. Returns the run folder.
 
     Args:
-        stage: ``rvq``, then ``masked``, then ``residual`` and ``control``; each needs the ones before it in ``root``.
+        stage: ``rvq``, then ``masked``, then ``residual`` and ``control``; each needs the ones before it in
+            ``root``.
         data: A HumanML3D-style folder with train and val lists.
         size: ``small``, ``paper`` or ``tiny``.
         root: Folder of all stages of one model.
@@ -69,7 +69,8 @@ def train_stage(
     """
     if stage not in STAGES or size not in SIZES:
         raise ValueError(
-            f"Unknown stage or size {stage!r}, {size!r}. Stages: {', '.join(STAGES)}; sizes: {', '.join(SIZES)}."
+            f"Unknown stage or size {stage!r}, {size!r}. "
+            f"Stages: {', '.join(STAGES)}; sizes: {', '.join(SIZES)}."
         )
     root = Path(root)
     settings = replace(_SETTINGS[stage][size], **(changes or {}))
