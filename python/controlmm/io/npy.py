@@ -70,10 +70,11 @@ def _motion_of(array: ndarray) -> Motion:
     values = torch.from_numpy(array.astype(np.float32))
     if not torch.isfinite(values).all():
         raise ValueError("expected finite numbers, the file holds NaN or infinity.")
+    has_frames = array.ndim > 0 and len(array) > 0
     for skeleton in SKELETONS.values():
-        if len(array) and array.shape[1:] == (skeleton.feature_dim,):
+        if has_frames and array.shape[1:] == (skeleton.feature_dim,):
             return Motion.from_features(values)
-        if len(array) and array.shape[1:] == (skeleton.num_joints, 3):
+        if has_frames and array.shape[1:] == (skeleton.num_joints, 3):
             return Motion(joints=values, skeleton=skeleton)
     raise ValueError(
         "expected features (T, 263) or (T, 251), or joints (T, 22, 3) or (T, 21, 3), with T >= 1, "

@@ -7,6 +7,8 @@ angles between the bones of a joint with several children, so those are measured
 
 from __future__ import annotations
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -16,9 +18,9 @@ from controlmm.motion.skeleton import Skeleton
 from controlmm.motion.wahba import best_rotation
 
 # Ankle to ball of a foot that stands flat on the floor: 25 degrees down, the mean over HumanML3D clips.
-_FOOT = (0.0, -0.4226, 0.9063)
+_FOOT = (0.0, -math.sin(math.radians(25)), math.cos(math.radians(25)))
 # Neck to the base of the skull of someone who looks ahead. Straight up, figures would stare at the floor.
-_HEAD = (0.0, 0.7660, 0.6428)
+_HEAD = (0.0, math.cos(math.radians(40)), math.sin(math.radians(40)))
 _UP = (0.0, 1.0, 0.0)
 _PROCRUSTES_ROUNDS = 3
 _TINY = 1e-9

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 # Weight of the prior relative to the vectors: only decides what the vectors leave open.
-_PRIOR_WEIGHT = 1e-6
+_PRIOR_WEIGHT = 1e-10
 
 
 def best_rotation(
