@@ -1,0 +1,1 @@
+"""The command ``controlmm``: one thin file a subcommand."""

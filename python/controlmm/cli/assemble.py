@@ -1,0 +1,74 @@
+"""``controlmm assemble``: four trained stages in, one model folder out."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+if TYPE_CHECKING:
+    from controlmm.text import TextEncoder
+
+# Folder of each network in a model, and the stage that trained it.
+_STAGE_OF = {"tokenizer": "rvq", "transformer": "masked", "residual": "residual", "control": "control"}
+
+
+def assemble(
+    root: Annotated[Path, typer.Argument(help="Folder that `controlmm train --out` filled.")],
+    out: Annotated[Path, typer.Option(help="Model folder to write.")],
+    half: Annotated[bool, typer.Option("--half", help="Store weights as float16: half the size.")] = False,
+    text: Annotated[
+        Literal["minilm", "clip", "hashing"] | None,
+        typer.Option(help="Text encoder; by default the one that training wrote down.", show_default=False),
+    ] = None,
+    text_folder: Annotated[
+        Path | None, typer.Option(help="Where the text encoder's weights are, if not in their package.")
+    ] = None,
+) -> None:
+    """Put the best weights of all four stages together, to generate with."""
+    import torch
+
+    from controlmm.models.control_branch import ControlBranch
+    from controlmm.models.masked_transformer import MaskedTransformer
+    from controlmm.models.residual_transformer import ResidualTransformer
+    from controlmm.pipelines import ControlMM
+    from controlmm.training.run_folder import SETTINGS_FILE
+    from controlmm.training.stages import load_tokenizer
+
+    tokenizer, normalizer = load_tokenizer(root)
+    pipeline = ControlMM(
+        tokenizer=tokenizer,
+        transformer=MaskedTransformer.from_pretrained(_best(root, "masked")),
+        residual=ResidualTransformer.from_pretrained(_best(root, "residual")),
+        control=ControlBranch.from_pretrained(_best(root, "control")),
+        normalizer=normalizer,
+        text_encoder=_text_encoder(root, text, text_folder),
+    )
+    pipeline.save_pretrained(out, dtype=torch.float16 if half else torch.float32)
+    for network, stage in _STAGE_OF.items():
+        shutil.copyfile(root / stage / SETTINGS_FILE, out / network / SETTINGS_FILE)
+    size = sum(file.stat().st_size for file in out.rglob("*") if file.is_file()) / 1e6
+    typer.echo(f"{out}: {size:.1f} MB, {pipeline.num_parameters / 1e6:.2f} million parameters")
+    typer.echo(f'Next: controlmm generate "a person walks forward" --model {out}')
+
+
+def _best(root: Path, stage: str) -> Path:
+    folder = root / stage / "best"
+    if not folder.is_dir():
+        raise FileNotFoundError(
+            f"{root / stage} holds no trained stage. Run `controlmm train {stage}` first."
+        )
+    return folder
+
+
+def _text_encoder(root: Path, kind: str | None, folder: Path | None) -> TextEncoder:
+    from controlmm.pipelines.folder import TEXT_ENCODER_FILE, read_json
+    from controlmm.text import load_text_encoder
+
+    if kind is not None:
+        return load_text_encoder({"kind": kind}, folder=folder)
+    if not (root / TEXT_ENCODER_FILE).is_file():
+        raise FileNotFoundError(f"No {TEXT_ENCODER_FILE} in {root}: say with `--text` which one trained it.")
+    return load_text_encoder(read_json(root / TEXT_ENCODER_FILE), folder=folder)

@@ -1,0 +1,143 @@
+"""``controlmm generate``: a prompt and controls in, motion files out."""
+
+from __future__ import annotations
+
+import re
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from controlmm.cli.phase_bars import PhaseBars
+from controlmm.cli.table import format_table
+
+if TYPE_CHECKING:
+    from controlmm.controls import ControlFile
+    from controlmm.pipelines import GenerationResult
+
+_SLUG_LENGTH = 48
+_TITLES = ("sample", "control error (cm)", "foot skating ratio", "BVH fit error (mm)", "time (s)")
+_PER_METRE = {"m": 1.0, "mm": 1000.0}  # of a skeleton's unit
+
+
+def generate(
+    prompt: Annotated[
+        str | None, typer.Argument(help="What the person does. By default the control file's prompt.")
+    ] = None,
+    seconds: Annotated[
+        float | None,
+        typer.Option(help="Length, 0.4 to 9.8. By default the control file's, else 6.", show_default=False),
+    ] = None,
+    controls: Annotated[Path | None, typer.Option(help="Control file: .json, .csv, .npy or .npz.")] = None,
+    preset: Annotated[str, typer.Option(help="fast, balanced or accurate.")] = "balanced",
+    samples: Annotated[int, typer.Option(help="Number of motions.")] = 1,
+    seed: Annotated[int, typer.Option(help="Same seed, same motions.")] = 0,
+    formats: Annotated[
+        str, typer.Option(help="Files to write, comma-separated: npz, npy, bvh, png, gif, mp4.")
+    ] = "npz,bvh,png",
+    out: Annotated[Path, typer.Option(help="Folder for the files; is made.")] = Path("out"),
+    model: Annotated[
+        Path | None, typer.Option(help="Model folder. By default the model that comes with the package.")
+    ] = None,
+    guidance: Annotated[
+        float | None,
+        typer.Option(help="How strongly the text counts. By default the preset's.", show_default=False),
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but the names of the files.")] = False,
+) -> None:
+    """Generate motions and print how well each of them meets its controls."""
+    from controlmm.controls import load_controls
+
+    suffixes = _checked_formats(formats)
+    document = load_controls(controls) if controls else None
+    prompt = _chosen_prompt(prompt, document)
+    seconds = _chosen_seconds(seconds, document, controls)
+
+    from controlmm.pipelines import ControlMM
+
+    pipeline = ControlMM.from_pretrained(model)
+    with PhaseBars(enabled=not quiet) as bars:
+        result = pipeline(
+            prompt,
+            seconds=seconds,
+            controls=document.controls if document else (),
+            samples=samples,
+            preset=preset,
+            guidance_scale=guidance,
+            seed=seed,
+            progress=bars,
+        )
+    stem = f"{slug(prompt)}_{seed}"
+    files = [
+        motion.save(out / f"{stem}_{index}.{suffix}")
+        for index, motion in enumerate(result)
+        for suffix in suffixes
+    ]
+    if not quiet:
+        typer.echo(_report(result, has_bvh="bvh" in suffixes) + "\n")
+    typer.echo("\n".join(map(str, files)))
+
+
+def slug(prompt: str) -> str:
+    """A prompt as part of a file name: lower-case letters, digits and hyphens, cut at a word."""
+    words = "-".join(re.findall(r"[^\W_]+", prompt.lower()))
+    if len(words) <= _SLUG_LENGTH:
+        return words or "motion"
+    return words[:_SLUG_LENGTH].rpartition("-")[0] or words[:_SLUG_LENGTH]
+
+
+def _checked_formats(formats: str) -> list[str]:
+    from controlmm.motion.formats import known_suffixes
+
+    suffixes = [suffix.strip().lower().removeprefix(".") for suffix in formats.split(",") if suffix.strip()]
+    unknown = [suffix for suffix in suffixes if suffix not in known_suffixes()]
+    if unknown or not suffixes:
+        raise ValueError(
+            f"`--formats` must name some of {', '.join(known_suffixes())}, comma-separated, got {formats!r}."
+        )
+    if "mp4" in suffixes and find_spec("av") is None:  # better now than after minutes of generation
+        raise ModuleNotFoundError(
+            "`--formats mp4` needs PyAV: pip install 'controlmm[video]' (or ask for gif)."
+        )
+    return suffixes
+
+
+def _chosen_prompt(prompt: str | None, document: ControlFile | None) -> str:
+    if prompt is None and document is not None:
+        prompt = document.text
+    if prompt is None:
+        raise ValueError('Give a prompt, for example: controlmm generate "a person walks forward".')
+    return prompt
+
+
+def _chosen_seconds(seconds: float | None, document: ControlFile | None, path: Path | None) -> float | None:
+    from controlmm.controls.shapes import MAX_SECONDS
+
+    if seconds is not None or document is None:
+        return seconds
+    if document.seconds is not None and document.seconds > MAX_SECONDS:
+        raise ValueError(
+            f"{path} is {document.seconds:g} s long, a motion is at most {MAX_SECONDS} s. Cut the file, or "
+            "pass `--seconds` if its controls end earlier."
+        )
+    return document.seconds
+
+
+def _report(result: GenerationResult, *, has_bvh: bool) -> str:
+    """One row a sample. All samples are generated together, so each takes an equal share of the time."""
+    import torch
+
+    from controlmm.evaluation import foot_skating_ratio
+    from controlmm.motion.rotation_fit import fit_rotations
+
+    skeleton = result[0].skeleton
+    unit = _PER_METRE[skeleton.unit]
+    skating = foot_skating_ratio(torch.stack([motion.joints for motion in result]), skeleton=skeleton)
+    rows = []
+    for index, motion in enumerate(result):
+        error = f"{100 * result.control_error[index].item() / unit:.2f}" if motion.extra else "-"
+        fit = f"{1000 * fit_rotations(motion.joints, skeleton).mean_error / unit:.1f}" if has_bvh else "-"
+        share = result.seconds_taken / len(result)
+        rows.append((str(index), error, f"{skating[index].item():.3f}", fit, f"{share:.1f}"))
+    return format_table(_TITLES, rows)

@@ -1,0 +1,106 @@
+"""``controlmm train``: one stage of a model, resumable."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+if TYPE_CHECKING:
+    from controlmm.text import TextEncoder
+
+COMMAND_FILE = "command.txt"  # in the run folder: every command line that worked on it
+_INTERRUPTED = 130  # exit code of a command that Ctrl-C ended
+
+_Stage = Literal["rvq", "masked", "residual", "control"]
+_Size = Literal["small", "paper", "tiny"]
+_Text = Literal["minilm", "clip", "hashing"]
+
+
+def train(
+    stage: Annotated[_Stage, typer.Argument(help="Train them in this order; each needs the ones before.")],
+    data: Annotated[Path, typer.Option(help="HumanML3D-style folder, see `controlmm prepare`.")],
+    out: Annotated[Path, typer.Option(help="Folder of the model; the stage gets a run folder in it.")],
+    config: Annotated[_Size, typer.Option(help="Size of the networks and length of the training.")] = "small",
+    text: Annotated[_Text, typer.Option(help="Text encoder; the same for all stages.")] = "minilm",
+    text_folder: Annotated[
+        Path | None, typer.Option(help="Where the text encoder's weights are, if not in their package.")
+    ] = None,
+    steps: Annotated[int | None, typer.Option(help="Optimiser steps.", show_default=False)] = None,
+    batch_size: Annotated[int | None, typer.Option(help="Clips a step.", show_default=False)] = None,
+    learning_rate: Annotated[float | None, typer.Option(help="Peak rate.", show_default=False)] = None,
+    seed: Annotated[int | None, typer.Option(help="Weights and batches.", show_default=False)] = None,
+    threads: Annotated[
+        int | None, typer.Option(help="Threads of torch; by default all.", min=1, show_default=False)
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bars.")] = False,
+) -> None:
+    """Train one stage; the same command goes on where a stopped or killed run left off."""
+    import torch
+
+    from controlmm.data import MotionFolder
+    from controlmm.training.stages import train_stage
+
+    if threads is not None:
+        torch.set_num_threads(threads)
+    MotionFolder(data)  # before anything is written: a missing folder leaves no trace of a run
+    given = {"steps": steps, "batch_size": batch_size, "learning_rate": learning_rate, "seed": seed}
+    changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    encoder = None if stage == "rvq" else _load_encoder(text, text_folder, out)
+    _store_command(out / stage)
+    try:
+        with _validations_above_the_bar(quiet=quiet):
+            run = train_stage(
+                stage,
+                data=data,
+                size=config,
+                root=out,
+                text_encoder=encoder,
+                changes=changes,
+                progress=not quiet,
+            )
+    except KeyboardInterrupt:
+        typer.echo(
+            f"\nStopped. The same command resumes from the last checkpoint in {out / stage}.", err=True
+        )
+        raise typer.Exit(_INTERRUPTED) from None
+    typer.echo(f"{run}: done, best weights in {run / 'best'}; see its curves with: controlmm plot {run}")
+
+
+def _load_encoder(kind: str, folder: Path | None, root: Path) -> TextEncoder:
+    """The text encoder, which the first stage that needs one writes down and the others must repeat."""
+    from controlmm.pipelines.folder import TEXT_ENCODER_FILE, read_json, write_json
+    from controlmm.text import check_same_encoder, load_text_encoder
+
+    encoder = load_text_encoder({"kind": kind}, folder=folder)
+    file = root / TEXT_ENCODER_FILE
+    if file.is_file():
+        check_same_encoder(read_json(file), encoder)
+    else:
+        root.mkdir(parents=True, exist_ok=True)
+        write_json(file, encoder.config())
+    return encoder
+
+
+def _store_command(run: Path) -> None:
+    run.mkdir(parents=True, exist_ok=True)
+    with (run / COMMAND_FILE).open("a", encoding="utf-8") as file:
+        file.write(shlex.join(["controlmm", *sys.argv[1:]]) + "\n")
+
+
+def _validations_above_the_bar(*, quiet: bool) -> Any:
+    """Print the metrics of every validation without breaking the progress bar."""
+    import contextlib
+    import logging
+
+    from tqdm.contrib.logging import logging_redirect_tqdm
+
+    if quiet:
+        return contextlib.nullcontext()
+    logger = logging.getLogger("controlmm")
+    logging.basicConfig(format="%(message)s")
+    logger.setLevel(logging.INFO)
+    return logging_redirect_tqdm()
