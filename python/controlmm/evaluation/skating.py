@@ -25,9 +25,9 @@ def foot_skating_ratio(
 ) -> Float[Tensor, "B"]:
     """Share of the frame pairs in which a foot slides; recorded motion has 0.05 to 0.075, not 0.
 
-    A foot slides when the ball of it is lower than 5 cm in both frames of a pair, and its horizontal speed and
-    the 5-frame average of that speed (zeros beyond both ends) are above 0.5 m/s. The published scripts divide
-    by the 195 pairs of the padded clip; here padding counts neither above nor below the line.
+    A foot slides when the ball of it is lower than 5 cm in both frames of a pair, and its horizontal speed
+    and the 5-frame average of that speed (zeros beyond both ends) are above 0.5 m/s. The published scripts
+    divide by the 195 pairs of the padded clip; here padding counts neither above nor below the line.
 
     Args:
         joints: Global positions in the skeleton's unit, Y up, ground at y = 0, at the skeleton's frame rate.
