@@ -68,12 +68,7 @@ def joints_to_features(joints: Float[Tensor, "F J 3"], *, public_quirks: bool = 
     groups = [yaw_velocity, root_velocity, joints[:-1, 0, 1:2], local_positions]
     groups += [matrix_to_rot6d(quat_to_matrix(rotations)).flatten(1), joint_velocities, contacts]
     features = torch.cat(groups, dim=-1)
-    if not torch.isfinite(features).all():
-        frame = int((~torch.isfinite(features)).any(1).nonzero()[0])
-        raise ValueError(
-            f"The pose of frame {frame} has no defined rotations (coinciding joints or a bone turned by "
-            "exactly 180 degrees). Leave the clip out or move its joints a little."
-        )
+    _check_defined(features)
     return features
 
 
@@ -94,8 +89,7 @@ def canonicalize(joints: Float[Tensor, "F J 3"]) -> Float[Tensor, "F J 3"]:
         raise ValueError(
             "Frame 0 faces nowhere: the left and right hips and shoulders coincide seen from above."
         )
-    turn = quat_between((forward / forward.norm()).float(), torch.tensor([0.0, 0.0, 1.0]))
-    return quat_rotate(turn, joints.float())
+    return quat_rotate(_heading(forward), joints.float())
 
 
 def retarget(joints: Float[Tensor, "F J 3"], target_offsets: Float[Tensor, "J 3"]) -> Float[Tensor, "F J 3"]:
@@ -106,7 +100,8 @@ def retarget(joints: Float[Tensor, "F J 3"], target_offsets: Float[Tensor, "J 3"
         target_offsets: Rest-pose offsets of the target, :meth:`Skeleton.rest_offsets`.
 
     Raises:
-        ValueError: If the shape is wrong or a leg has no length.
+        ValueError: If the shape is wrong, a leg has no length, or a facing direction or bone rotation is
+            undefined.
     """
     skeleton = _checked_skeleton(joints, minimum_frames=1)
     joints, target_offsets = joints.double(), target_offsets.double()
@@ -121,7 +116,9 @@ def retarget(joints: Float[Tensor, "F J 3"], target_offsets: Float[Tensor, "J 3"
     heading = _heading(_forward(joints, skeleton))
     heading[0] = heading.new_tensor([1, 0, 0, 0])
     rotations = inverse_kinematics(joints.float(), heading, skeleton)
-    return forward_kinematics(rotations, root_path, target_offsets.float(), skeleton)
+    retargeted = forward_kinematics(rotations, root_path, target_offsets.float(), skeleton)
+    _check_defined(retargeted.flatten(1))
+    return retargeted
 
 
 def bone_lengths(joints: Float[Tensor, "F J 3"], skeleton: Skeleton) -> Float[Tensor, "F J"]:
@@ -179,11 +176,21 @@ def _checked_skeleton(joints: Tensor, *, minimum_frames: int) -> Skeleton:
     return skeleton_of_joints(joints.shape[1])
 
 
+def _check_defined(values: Float[Tensor, "F N"]) -> None:
+    undefined = (~torch.isfinite(values)).any(1)
+    if undefined.any():
+        raise ValueError(
+            f"The pose of frame {int(undefined.nonzero()[0])} has no defined rotations (coinciding joints or "
+            "a bone turned by exactly 180 degrees). Leave the clip out or move its joints a little."
+        )
+
+
 def _forward(joints: Float[Tensor, "F J 3"], skeleton: Skeleton) -> Float[Tensor, "F 3"]:
     # Hips and shoulders enter with opposite signs, unlike in `canonicalize`: so do the public scripts.
     right_hip, left_hip, right_shoulder, left_shoulder = skeleton.facing
     across = joints[:, left_hip] - joints[:, right_hip] + joints[:, right_shoulder] - joints[:, left_shoulder]
     across = across / across.norm(dim=-1, keepdim=True)
+    _check_defined(across)  # here, since smoothing would blame the frames around
     return torch.linalg.cross(joints.new_tensor([0, 1, 0]).expand_as(across), across, dim=-1)
 
 
@@ -193,13 +200,16 @@ def _smooth(forward: Float[Tensor, "F 3"]) -> Float[Tensor, "F 3"]:
     kernel = torch.exp(-0.5 * (offsets / FACING_SIGMA) ** 2)
     kernel = kernel / kernel.sum()
     padded = torch.cat([forward[:1].expand(radius, 3), forward, forward[-1:].expand(radius, 3)])
-    smoothed: Tensor = torch.nn.functional.conv1d(padded.T[:, None], kernel[None, None])
-    return smoothed[:, 0].T
+    smoothed: Tensor = torch.nn.functional.conv1d(padded.t()[:, None], kernel[None, None])
+    return smoothed.squeeze(1).t()
 
 
-def _heading(forward: Float[Tensor, "F 3"]) -> Float[Tensor, "F 4"]:
+def _heading(forward: Float[Tensor, "*F 3"]) -> Float[Tensor, "*F 4"]:
     forward = (forward / forward.norm(dim=-1, keepdim=True)).float()
-    return quat_between(forward, forward.new_tensor([0, 0, 1]))
+    turn = quat_between(forward, forward.new_tensor([0, 0, 1]))
+    # Where the body faces exactly -Z the public scripts give NaN, but it can only turn about Y.
+    is_backward = (forward[..., :1] == 0) & (forward[..., 2:] < 0)
+    return torch.where(is_backward, turn.new_tensor([0, 0, 1, 0]), turn)
 
 
 def _half_angle(turn: Float[Tensor, "T 4"], *, keep_wrap: bool) -> Float[Tensor, "T"]:

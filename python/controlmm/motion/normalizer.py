@@ -34,8 +34,13 @@ class Normalizer(nn.Module):
             raise ValueError(
                 f"`mean` and `std` must both be (D,), got {tuple(mean.shape)}, {tuple(std.shape)}."
             )
-        if not (torch.isfinite(mean).all() and torch.isfinite(std).all() and (std > 0).all()):
-            raise ValueError("`mean` must be finite and `std` finite and positive in every channel.")
+        unusable = ~(torch.isfinite(mean) & torch.isfinite(std) & (std > 0))
+        if unusable.any():
+            channel = int(unusable.nonzero()[0])
+            raise ValueError(
+                "`mean` must be finite and `std` finite and positive in every channel, but channel "
+                f"{channel} has mean {float(mean[channel]):g} and std {float(std[channel]):g}."
+            )
         self.register_buffer("mean", mean.float())
         self.register_buffer("std", std.float())
 
