@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from jaxtyping import Float
@@ -23,6 +24,19 @@ class Caption:
     def is_partial(self) -> bool:
         """Whether the sentence speaks of ``start`` to ``end`` only."""
         return self.end > self.start
+
+
+def parse_caption(line: str, kind: str = "annotator") -> Caption:
+    """A line ``sentence#word/TAG ...#start#end`` of a text file; no or NaN times mean the whole clip."""
+    text, *rest = line.split("#")
+    times = []
+    for value in rest[1:3]:
+        try:
+            times.append(float(value))
+        except ValueError:
+            times.append(0.0)
+    start, end = times if len(times) == 2 and all(map(math.isfinite, times)) else (0.0, 0.0)
+    return Caption(text.strip(), kind, start, end)
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from controlmm.data.clip import SPLITS, Caption, Clip, FeatureClip
+from controlmm.data.clip import SPLITS, Caption, Clip, FeatureClip, parse_caption
 from controlmm.motion.features import canonicalize, joints_to_features, retarget
 from controlmm.motion.mirror import mirror_joints, mirror_text
 from controlmm.motion.normalizer import channel_statistics
@@ -26,6 +27,7 @@ class MotionFolder:
 
     Raises:
         FileNotFoundError: If the folder or its feature folder is missing; the message says what was expected.
+        ValueError: If its ``clips.jsonl`` is damaged.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -49,7 +51,7 @@ class MotionFolder:
 
         Raises:
             FileNotFoundError: If the list is missing.
-            ValueError: If a feature file is damaged.
+            ValueError: If a feature file is damaged, or its captions do not fit ``clips.jsonl``.
         """
         for name in tqdm(self.ids(split), desc=f"reading {split}", disable=not progress):
             file = self.path / "new_joint_vecs" / f"{name}.npy"
@@ -71,27 +73,22 @@ class MotionFolder:
             return ()
         lines = [line for line in file.read_text(encoding="utf-8").splitlines() if line.strip()]
         kinds = kinds or ["annotator"] * len(lines)
+        if len(kinds) != len(lines):
+            raise ValueError(
+                f"{file} has {len(lines)} captions, but {CLIPS_FILE} says {len(kinds)}. "
+                f"Prepare the folder again, or remove {CLIPS_FILE} to read the captions without their kinds."
+            )
         return tuple(parse_caption(line, kind) for line, kind in zip(lines, kinds, strict=True))
 
     def _read_about(self) -> dict[str, dict[str, Any]]:
         file = self.path / CLIPS_FILE
         if not file.is_file():
             return {}
-        records = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
-        return {record["id"]: record for record in records}
-
-
-def parse_caption(line: str, kind: str = "annotator") -> Caption:
-    """A line ``sentence#word/TAG ...#start#end`` of a text file; no or NaN times mean the whole clip."""
-    text, *rest = line.split("#")
-    times = []
-    for value in rest[1:3]:
         try:
-            times.append(float(value))
-        except ValueError:
-            times.append(0.0)
-    start, end = times if len(times) == 2 and all(np.isfinite(times)) else (0.0, 0.0)
-    return Caption(text.strip(), kind, start, end)
+            records = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+            return {record["id"]: record for record in records}
+        except (json.JSONDecodeError, KeyError, TypeError) as error:
+            raise ValueError(f"{file} is damaged ({error!r}). Prepare the folder again.") from error
 
 
 def write_folder(
@@ -116,17 +113,20 @@ def write_folder(
         progress: Show a progress bar.
 
     Raises:
-        ValueError: If a clip has undefined features; the message names it.
+        ValueError: If a clip has undefined features, a name that is taken or no plain file name, or a caption
+            that a text file cannot hold (empty, several lines, a ``#``); the message names the clip.
     """
     path = Path(path)
     for folder in ("new_joint_vecs", "new_joints", "texts"):
         (path / folder).mkdir(parents=True, exist_ok=True)
     splits: dict[str, list[str]] = {split: [] for split in SPLITS}
-    about = []
+    about: list[dict[str, Any]] = []
+    taken: set[str] = set()
     for clip in tqdm(clips, desc="preparing", unit="clip", disable=not progress):
         try:
             joints = _placed(clip, retarget_bones=retarget_bones, canonical=canonical)
             for version in [clip, _mirrored(clip)] if mirror else [clip]:
+                _check_writable(version, taken)
                 placed = joints if version is clip else mirror_joints(joints)
                 _write_clip(path, version, joints_to_features(placed, public_quirks=public_quirks))
                 splits.setdefault(clip.split, []).append(version.id)
@@ -141,6 +141,20 @@ def write_folder(
     (path / CLIPS_FILE).write_text("".join(json.dumps(record) + "\n" for record in about), encoding="utf-8")
     _write_statistics(path)
     return len(about)
+
+
+def _check_writable(clip: Clip, taken: set[str]) -> None:
+    """HumanML3D's lists hold a name a line, its text files a caption a line with ``#`` before the tags."""
+    if not re.fullmatch(r"[^\s/\\]+", clip.id):
+        raise ValueError(f"`id` must be a file name without white space, got {clip.id!r}.")
+    if clip.id in taken:
+        raise ValueError(f"Two clips have the `id` {clip.id!r} (mirrored clips get an M before theirs).")
+    taken.add(clip.id)
+    for caption in clip.captions:
+        if not caption.text.strip() or "#" in caption.text or len(caption.text.splitlines()) != 1:
+            raise ValueError(
+                f"A caption must be one line of text without '#', got {caption.text!r}. Change or drop it."
+            )
 
 
 def _placed(clip: Clip, *, retarget_bones: bool, canonical: bool) -> torch.Tensor:

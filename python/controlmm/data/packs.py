@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+import zlib
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from controlmm.data.clip import SPLITS, Caption, Clip
+from controlmm.data.clip import SPLITS, Caption, Clip, parse_caption
 
 CAPTIONS_FILE = "captions.jsonl"
+_RECORD_KEYS = {"id", "file", "source", "licence", "split", "captions", "caption_kinds"}
 
 
 def read_packs(folder: Path, *, sources: Collection[str] | None = None) -> Iterator[Clip]:
@@ -21,8 +23,8 @@ def read_packs(folder: Path, *, sources: Collection[str] | None = None) -> Itera
 
     Args:
         folder: Holds ``captions.jsonl`` (one JSON object a clip with ``id``, ``file``, ``source``, ``split``,
-            ``captions``, ``caption_kinds``) and the packs it names (members ``ids``, ``offsets``, ``root``,
-            ``rel``, ``rel_unit``).
+            ``licence``, ``captions``, ``caption_kinds``), and the packs it names (members ``ids``,
+            ``offsets``, ``root``, ``rel``, ``rel_unit``).
         sources: Read only these sources; ``None`` reads all.
 
     Raises:
@@ -41,10 +43,8 @@ def read_packs(folder: Path, *, sources: Collection[str] | None = None) -> Itera
         name = record["file"]
         if name not in packs:
             packs[name] = _Pack(folder / name)
-        captions = tuple(
-            Caption(text, kind)
-            for text, kind in zip(record["captions"], record["caption_kinds"], strict=True)
-        )
+        pairs = zip(record["captions"], record["caption_kinds"], strict=True)
+        captions = tuple(Caption(text, kind) for text, kind in pairs)
         yield Clip(
             record["id"],
             packs[name].joints(record["id"]),
@@ -58,8 +58,8 @@ def read_packs(folder: Path, *, sources: Collection[str] | None = None) -> Itera
 def read_joint_folder(folder: Path) -> Iterator[Clip]:
     """Clips of a folder of ``NAME.npy`` joint positions (F, 22, 3), with captions in ``NAME.txt``.
 
-    A sentence a line; captions may be missing. All clips are of split ``train`` unless ``val.txt`` or
-    ``test.txt`` beside them list the name.
+    A sentence a line, plain or as HumanML3D's text files have it; captions may be missing. All clips are of
+    split ``train`` unless ``val.txt`` or ``test.txt`` beside them list the name.
 
     Raises:
         FileNotFoundError: If the folder does not exist or holds no ``.npy`` file.
@@ -74,7 +74,7 @@ def read_joint_folder(folder: Path) -> Iterator[Clip]:
             joints = torch.from_numpy(np.load(file, allow_pickle=False))
         except (ValueError, EOFError, OSError, TypeError) as error:
             raise ValueError(f"{file} is not a readable .npy file: {error}") from error
-        captions = tuple(Caption(line) for line in _lines(file.with_suffix(".txt")))
+        captions = tuple(parse_caption(line) for line in _lines(file.with_suffix(".txt")))
         yield Clip(file.stem, joints, captions, source=folder.name, split=split_of.get(file.stem, "train"))
 
 
@@ -87,13 +87,16 @@ class _Pack:
         try:
             with np.load(path, allow_pickle=False) as pack:
                 members = {name: pack[name] for name in ("ids", "offsets", "root", "rel", "rel_unit")}
-        except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        except (ValueError, KeyError, EOFError, OSError, zlib.error, zipfile.BadZipFile) as error:
             raise ValueError(f"{path} is not a readable motion pack: {error}") from error
+        self.path = path
         self.index = {str(name): i for i, name in enumerate(members["ids"])}
         self.offsets, self.root = members["offsets"], members["root"]
         self.relative, self.unit = members["rel"], float(members["rel_unit"])
 
     def joints(self, clip_id: str) -> torch.Tensor:
+        if clip_id not in self.index:
+            raise ValueError(f"{self.path} has no clip {clip_id!r}, which {CAPTIONS_FILE} puts there.")
         i = self.index[clip_id]
         frames = slice(self.offsets[i], self.offsets[i + 1])
         root = self.root[frames].astype(np.float64)[:, None]
@@ -106,10 +109,21 @@ def _read_records(path: Path) -> list[dict[str, Any]]:
     records = []
     for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
         try:
-            records.append(json.loads(line))
+            record = json.loads(line)
         except json.JSONDecodeError as error:
             raise ValueError(f"{path}, line {number}: broken JSON ({error.msg}).") from error
+        _check_record(record, f"{path}, line {number}")
+        records.append(record)
     return records
+
+
+def _check_record(record: Any, where: str) -> None:
+    missing = sorted(_RECORD_KEYS - set(record)) if isinstance(record, dict) else sorted(_RECORD_KEYS)
+    if missing:
+        raise ValueError(f"{where}: expected a JSON object with {', '.join(missing)}.")
+    captions, kinds = len(record["captions"]), len(record["caption_kinds"])
+    if captions != kinds:
+        raise ValueError(f"{where}: {captions} captions but {kinds} caption kinds.")
 
 
 def _lines(path: Path) -> list[str]:
