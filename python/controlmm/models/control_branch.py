@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from controlmm.models.masked_transformer import MaskedTransformer, MaskedTransformerConfig, with_text_token
+from controlmm.motion.skeleton import Skeleton
 from controlmm.nn.checkpoint import PretrainedModel
 from controlmm.nn.conv import ConvEncoder
 from controlmm.nn.trunk import encoder_layers
@@ -68,6 +69,13 @@ class ControlBranchConfig:
             width=16, heads=2, layers=2, feedforward=32, dropout=0.0, joints=tuple(range(22)),
             encoder_width=8, encoder_depth=1,
         )  # fmt: skip
+
+    def for_skeleton(self, skeleton: Skeleton) -> ControlBranchConfig:
+        """The same sizes for another skeleton: all of its joints, or its six control joints."""
+        names_all = len(self.joints) > len(skeleton.control_joints)
+        return replace(
+            self, joints=tuple(range(skeleton.num_joints)) if names_all else skeleton.control_joints
+        )
 
     def check_base(self, base: MaskedTransformerConfig) -> None:
         """Raise ``ValueError`` unless the branch fits the masked transformer."""

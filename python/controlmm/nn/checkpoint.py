@@ -35,7 +35,9 @@ class PretrainedModel(nn.Module):
             for name, value in self.state_dict().items()
             if name.rpartition(".")[2] not in self.training_state
         }
-        save_file(state, folder / WEIGHTS_FILE)
+        unfinished = folder / (WEIGHTS_FILE + ".tmp")
+        save_file(state, unfinished)
+        unfinished.replace(folder / WEIGHTS_FILE)  # whole or old, also when the process is killed
 
     @classmethod
     def from_pretrained(cls, folder: str | Path) -> Self:

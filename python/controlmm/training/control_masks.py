@@ -9,8 +9,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 # Shares of the kinds of control in training. The published modes are `trajectory` and `cross` with a uniform
-# density;
-# ours is heavy on sparse targets, which are what people give, and keeps a share without any control.
+# density; ours is heavy on sparse targets, which people give, and keeps a share without any control.
 _NO_CONTROL, _PATH, _TRAJECTORY, _POSE = 0.1, 0.2, 0.2, 0.1  # the rest: some joints at some frames
 
 

@@ -86,7 +86,8 @@ def train(
             best = _validate(recipe, folder, step + 1, best)
             if on_validation is not None:
                 on_validation(step + 1)
-        if (step + 1) % settings.checkpoint_every == 0 or last:
+        is_healthy = bad_steps == 0  # a batch that is not finite may have spoilt the codebooks' averages
+        if is_healthy and ((step + 1) % settings.checkpoint_every == 0 or last):
             folder.save_checkpoint(model, optimizer, step + 1, best)
     bar.close()
     return model
@@ -124,7 +125,7 @@ def _validate(recipe: Recipe, folder: RunFolder, step: int, best: float | None) 
         metrics = recipe.validate()
     folder.log({"step": step, **{f"val_{name}": value for name, value in metrics.items()}})
     _log.info("step %d: %s", step, ", ".join(f"{name} {value:.4g}" for name, value in metrics.items()))
-    if best is None or metrics["score"] < best:
+    if math.isfinite(metrics["score"]) and (best is None or metrics["score"] < best):
         recipe.model.save_pretrained(folder.path / "best")
         return metrics["score"]
     return best

@@ -34,7 +34,7 @@ class RunFolder:
         """
         file = self.path / SETTINGS_FILE
         if self.has_checkpoint and file.is_file():
-            before = json.loads(file.read_text(encoding="utf-8"))
+            before = _read_settings(file)
             now = json.loads(json.dumps(settings))
             changed = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
             if changed:
@@ -98,11 +98,19 @@ class RunFolder:
                     if name.startswith("model.")
                 }
             )
-        except (SafetensorError, RuntimeError, KeyError) as error:
+        except (SafetensorError, RuntimeError, KeyError, TypeError) as error:
             reason = " ".join(str(error).split())
             raise ValueError(f"{file} is damaged or belongs to another network: {reason}") from error
         _load_optimizer(optimizer, {n: v for n, v in state.items() if n.startswith("optimizer.")})
         return progress["step"], progress["best"]
+
+
+def _read_settings(file: Path) -> dict[str, Any]:
+    try:
+        settings: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{file} is damaged ({error}). Restore it or choose another folder.") from error
+    return settings
 
 
 def _load_optimizer(optimizer: torch.optim.Optimizer, tensors: dict[str, torch.Tensor]) -> None:

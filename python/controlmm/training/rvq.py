@@ -60,6 +60,8 @@ class RvqRecipe:
         self.joint_weight = joint_weight
         self._windows = WindowSampler(train_clips, normalizer, length=WINDOW)
         self._val_clips = [clip for clip in val_clips if len(clip.features) >= config.downsample]
+        if not self._val_clips:
+            raise ValueError("The validation split has no readable clip.")
         self._positions = feature_layout(normalizer.skeleton).local_positions
 
     def loss(self, batch_size: int) -> dict[str, Tensor]:

@@ -137,6 +137,7 @@ def _token_recipe(
         _need(root, "masked")
         base = MaskedTransformer.from_pretrained(root / "masked" / "best")
         decoder = MotionDecoder(tokenizer, normalizer)
+        config = config.for_skeleton(normalizer.skeleton)
         return control.ControlRecipe(config, base, decoder, tokens(train_clips), tokens(val_clips))
     recipes: dict[str, Callable[..., Recipe]] = {
         "masked": masked.MaskedRecipe,
