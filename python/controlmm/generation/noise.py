@@ -13,7 +13,7 @@ _SPREAD = 0x9E3779B97F4A7C15  # odd 64-bit constant: neighbouring seeds give unr
 
 def clip_seeds(seed: int, count: int) -> list[int]:
     """A seed for each of ``count`` samples; sample ``i`` of a seed is the same however many are asked for."""
-    return [(seed * _SPREAD + index * 0xBF58476D1CE4E5B9) % 2**63 for index in range(count)]
+    return [(int(seed) * _SPREAD + index * 0xBF58476D1CE4E5B9) % 2**63 for index in range(count)]
 
 
 class ClipNoise:

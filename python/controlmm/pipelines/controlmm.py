@@ -34,10 +34,10 @@ from controlmm.motion.normalizer import Normalizer
 from controlmm.motion.skeleton import Skeleton
 from controlmm.nn.checkpoint import PretrainedModel
 from controlmm.pipelines import folder as files
-from controlmm.pipelines.checks import check_sampling, frame_count
+from controlmm.pipelines.checks import check_masks_end, check_sampling, check_sizes, frame_count
 from controlmm.pipelines.output import GenerationResult
 from controlmm.pipelines.placement import moved, start_position
-from controlmm.pipelines.presets import Preset, preset_named
+from controlmm.pipelines.presets import Preset, resolve_preset
 from controlmm.text import TextEncoder, check_prompt, check_same_encoder, load_text_encoder
 
 KIND = "controlmm"
@@ -64,11 +64,14 @@ class ControlMM:
         text_encoder: TextEncoder,
     ) -> None:
         control.config.check_base(transformer.config)
-        if text_encoder.dim != transformer.config.text_dim:
-            raise ValueError(
-                f"`text_encoder` gives {text_encoder.dim} numbers a prompt, the transformer wants "
-                f"{transformer.config.text_dim}."
-            )
+        check_sizes(
+            tokenizer=tokenizer.config,
+            transformer=transformer.config,
+            residual=residual.config,
+            control=control.config,
+            skeleton=normalizer.skeleton,
+            text_dim=text_encoder.dim,
+        )
         self.transformer = transformer.eval().requires_grad_(False)
         self.residual = residual.eval().requires_grad_(False)
         self.control = control.eval().requires_grad_(False)
@@ -163,7 +166,7 @@ class ControlMM:
         prompt = check_prompt(prompt)
         check_sampling(samples=samples, seed=seed)
         count = frame_count(seconds=seconds, frames=frames, skeleton=self.skeleton, max_frames=MAX_FRAMES)
-        plan = preset_named(preset) if isinstance(preset, str) else preset
+        plan = resolve_preset(preset)
         if guidance_scale is not None:
             plan = dataclasses.replace(plan, guidance_scale=guidance_scale)
         dense = densify(controls, count, self.skeleton)
@@ -201,7 +204,11 @@ class ControlMM:
         """Latents of a batch of clips of different texts, lengths and targets (canonical frame).
 
         Clips without any target are decoded from text alone, the control branch off.
+
+        Raises:
+            ValueError: If a target lies after the end of its clip.
         """
+        check_masks_end(mask, lengths)
         step = self.decoder.downsample
         tokens = torch.tensor([-(-length // step) for length in lengths])
         valid = frame_mask(tokens, int(tokens.max()))

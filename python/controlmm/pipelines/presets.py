@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from controlmm.generation.editing import EditingBudget
@@ -16,6 +17,14 @@ class Preset:
     guidance_scale: float = 4.0
     residual_guidance_scale: float = 5.0
 
+    def __post_init__(self) -> None:
+        if isinstance(self.steps, bool) or not isinstance(self.steps, int) or self.steps < 1:
+            raise ValueError(f"`steps` must be a whole number of at least 1, got {self.steps!r}.")
+        for name in ("guidance_scale", "residual_guidance_scale"):
+            value = getattr(self, name)
+            if not isinstance(value, int | float) or not math.isfinite(value):
+                raise ValueError(f"`{name}` must be a finite number, got {value!r}.")
+
 
 # The iteration counts are the papers' Fast, Medium and Accurate.
 PRESETS = {
@@ -23,6 +32,20 @@ PRESETS = {
     "balanced": Preset(EditingBudget(logits_iterations=0, latent_iterations=600)),
     "accurate": Preset(EditingBudget(logits_iterations=100, latent_iterations=600)),
 }
+
+
+def resolve_preset(preset: str | Preset) -> Preset:
+    """``preset`` itself, or the one of that name.
+
+    Raises:
+        TypeError: If it is neither.
+        ValueError: If there is none of that name.
+    """
+    if isinstance(preset, Preset):
+        return preset
+    if not isinstance(preset, str):
+        raise TypeError(f"`preset` must be a name or a Preset, got {type(preset).__name__}.")
+    return preset_named(preset)
 
 
 def preset_named(name: str) -> Preset:
