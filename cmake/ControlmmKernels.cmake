@@ -7,7 +7,10 @@ add_library(controlmm_kernels STATIC
   ${csrc}/runtime/consistency.cpp
   ${csrc}/runtime/cpu_features.cpp
   ${csrc}/runtime/dispatch.cpp
+  ${csrc}/runtime/guidance.cpp
   ${csrc}/runtime/kinematics.cpp
+  ${csrc}/runtime/obstacle_arguments.cpp
+  ${csrc}/runtime/obstacles.cpp
   ${csrc}/runtime/parallel.cpp)
 add_library(controlmm::kernels ALIAS controlmm_kernels)
 set_target_properties(controlmm_kernels PROPERTIES POSITION_INDEPENDENT_CODE ON EXPORT_NAME kernels)

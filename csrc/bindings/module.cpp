@@ -1,9 +1,8 @@
-#include "tensor_caster.h"
-
 #include <stdexcept>
 
 #include "controlmm/dispatch.h"
 #include "controlmm/kernels.h"
+#include "tensor_caster.h"
 
 namespace controlmm {
 namespace {
@@ -13,6 +12,14 @@ using Arg = const TensorArgument&;
 Norm norm_of(int code) {
   if (code < 0 || code > 2) throw std::invalid_argument("`norm` must be 0 (l2), 1 (l1) or 2 (mse).");
   return static_cast<Norm>(code);
+}
+
+Obstacles obstacles_of(Arg kinds, Arg parameters, Arg heights) {
+  return {kinds.view(), parameters.view(), heights.view()};
+}
+
+Clearance clearance_of(Arg radii, Arg is_active, Arg lengths, double margin, bool is_mean) {
+  return {radii.view(), is_active.view(), lengths.view(), margin, is_mean};
 }
 
 const char* bindings_name() { return CONTROLMM_BINDINGS_NAME; }
@@ -28,22 +35,58 @@ void register_kernels(Module& m) {
   m.def("active_isa", &active_isa);
   m.def("set_isa", &set_isa);
 
-  m.def("recover_joints", [](Arg features, Arg joints, int threads) {
-    recover_joints(features.view(), joints.view(), threads);
-  }, Unlocked());
-  m.def("recover_joints_backward", [](Arg features, Arg grad_joints, Arg grad_features, int threads) {
-    recover_joints_backward(features.view(), grad_joints.view(), grad_features.view(), threads);
-  }, Unlocked());
-  m.def("masked_consistency_loss",
-        [](Arg joints, Arg targets, Arg mask, int norm, Arg loss, Arg counts, int threads) {
-          masked_consistency_loss(joints.view(), targets.view(), mask.view(), norm_of(norm), loss.view(),
-                                  counts.view(), threads);
-        }, Unlocked());
-  m.def("masked_consistency_loss_backward",
-        [](Arg joints, Arg targets, Arg mask, int norm, Arg grad_loss, Arg counts, Arg grad_joints, int threads) {
-          masked_consistency_loss_backward(joints.view(), targets.view(), mask.view(), norm_of(norm),
-                                           grad_loss.view(), counts.view(), grad_joints.view(), threads);
-        }, Unlocked());
+  m.def(
+      "recover_joints",
+      [](Arg features, Arg joints, int threads) { recover_joints(features.view(), joints.view(), threads); },
+      Unlocked());
+  m.def(
+      "recover_joints_backward",
+      [](Arg features, Arg grad_joints, Arg grad_features, int threads) {
+        recover_joints_backward(features.view(), grad_joints.view(), grad_features.view(), threads);
+      },
+      Unlocked());
+  m.def(
+      "masked_consistency_loss",
+      [](Arg joints, Arg targets, Arg mask, int norm, Arg loss, Arg counts, int threads) {
+        masked_consistency_loss(joints.view(), targets.view(), mask.view(), norm_of(norm), loss.view(), counts.view(),
+                                threads);
+      },
+      Unlocked());
+  m.def(
+      "masked_consistency_loss_backward",
+      [](Arg joints, Arg targets, Arg mask, int norm, Arg grad_loss, Arg counts, Arg grad_joints, int threads) {
+        masked_consistency_loss_backward(joints.view(), targets.view(), mask.view(), norm_of(norm), grad_loss.view(),
+                                         counts.view(), grad_joints.view(), threads);
+      },
+      Unlocked());
+  m.def(
+      "obstacle_loss",
+      [](Arg joints, Arg kinds, Arg parameters, Arg heights, Arg radii, Arg is_active, Arg lengths, double margin,
+         bool is_mean, Arg loss, int threads) {
+        obstacle_loss(joints.view(), obstacles_of(kinds, parameters, heights),
+                      clearance_of(radii, is_active, lengths, margin, is_mean), loss.view(), threads);
+      },
+      Unlocked());
+  m.def(
+      "obstacle_loss_backward",
+      [](Arg joints, Arg kinds, Arg parameters, Arg heights, Arg radii, Arg is_active, Arg lengths, double margin,
+         bool is_mean, Arg grad_loss, Arg grad_joints, int threads) {
+        obstacle_loss_backward(joints.view(), obstacles_of(kinds, parameters, heights),
+                               clearance_of(radii, is_active, lengths, margin, is_mean), grad_loss.view(),
+                               grad_joints.view(), threads);
+      },
+      Unlocked());
+  m.def(
+      "guidance_value_and_grad",
+      [](Arg decoded, Arg mean, Arg std, Arg targets, Arg mask, int norm, Arg kinds, Arg parameters, Arg heights,
+         Arg radii, Arg is_active, Arg lengths, double margin, bool is_mean, double obstacle_weight, Arg loss,
+         Arg gradient, int threads) {
+        guidance_value_and_grad(decoded.view(), mean.view(), std.view(), targets.view(), mask.view(), norm_of(norm),
+                                obstacles_of(kinds, parameters, heights),
+                                clearance_of(radii, is_active, lengths, margin, is_mean), obstacle_weight, loss.view(),
+                                gradient.view(), threads);
+      },
+      Unlocked());
 }
 
 }  // namespace

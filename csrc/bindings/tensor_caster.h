@@ -6,6 +6,7 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
+
 #include "tensor_argument.h"
 namespace bindings = nanobind;
 #define CONTROLMM_MODULE(name, m) NB_MODULE(name, m)
@@ -34,6 +35,7 @@ struct type_caster<controlmm::TensorArgument> {
 
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
+
 #include "tensor_argument.h"
 namespace bindings = pybind11;
 #define CONTROLMM_MODULE(name, m) PYBIND11_MODULE(name, m)

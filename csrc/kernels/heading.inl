@@ -28,8 +28,8 @@ CONTROLMM_INLINE void sine_cosine(const Lanes<double>& angle, Lanes<double>& sin
     s = s * r2 + all(c);
   s = r + r * r2 * s;
   Lanes<double> c = all(1.0 / 20922789888000.0);
-  for (double k : {-1.0 / 87178291200.0, 1.0 / 479001600.0, -1.0 / 3628800.0, 1.0 / 40320.0, -1.0 / 720.0,
-                   1.0 / 24.0, -0.5})
+  for (double k :
+       {-1.0 / 87178291200.0, 1.0 / 479001600.0, -1.0 / 3628800.0, 1.0 / 40320.0, -1.0 / 720.0, 1.0 / 24.0, -0.5})
     c = c * r2 + all(k);
   c = all(1.0) + r2 * c;
 
@@ -55,7 +55,7 @@ inline void fill_cos_sin(const double* yaw, std::int64_t padded, Heading out) {
     sine_cosine(angle, sine, cosine);
     store(out.sin + t, sine);
     store(out.cos + t, cosine);
-    if (!any<double>(abs(angle) > broadcast(kLargestReducedAngle))) continue;
+    if (!any(abs(angle) > broadcast(kLargestReducedAngle))) continue;
     for (std::int64_t i = t; i < t + kLanes; ++i) {
       const double original = yaw[i];
       if (!(__builtin_fabs(original) > kLargestReducedAngle)) continue;

@@ -20,15 +20,20 @@ namespace controlmm {
 namespace CONTROLMM_ISA {
 namespace {
 
+// In this order: each file is written in terms of those above it.
+// clang-format off
 #include "simd.inl"
-// simd.inl first: everything below is written in its terms.
 #include "heading.inl"
 #include "recover_joints.inl"
 #include "consistency.inl"
+#include "obstacles.inl"
+#include "guidance.inl"
+// clang-format on
 
 template <class T>
 constexpr Kernels<T> kernels() {
-  return {&recover_joints<T>, &recover_joints_backward<T>, &consistency<T>, &consistency_backward<T>};
+  return {&recover_joints<T>, &recover_joints_backward<T>, &consistency<T>, &consistency_backward<T>,
+          &obstacle_loss<T>,  &obstacle_loss_backward<T>,  &guidance<T>};
 }
 
 }  // namespace

@@ -50,6 +50,43 @@ struct ConsistencyArgs {
   T* grad_joints;   // row-major; backward only
 };
 
+/// Obstacles and what counts against them, ready for the kernels: extents of 1 have become strides of 0.
+template <class T>
+struct ObstacleArgs {
+  std::int64_t count;
+  const std::int64_t* kinds;     // row-major [count, 4]
+  Strided4<const T> parameters;  // clip, frame, obstacle (as joint), parameter (as coord)
+  const T* heights;
+  const T* radii;                 // one a joint
+  const std::uint8_t* is_active;  // one a joint
+  const std::int64_t* lengths;    // one a clip
+  T margin;
+};
+
+template <class T>
+struct ObstacleLossArgs {
+  MotionShape shape;
+  Strided4<const T> joints;
+  ObstacleArgs<T> obstacles;
+  double* sums;             // one a clip
+  const T* scales;          // one a clip; backward only
+  Strided4<T> grad_joints;  // backward only
+};
+
+template <class T>
+struct GuidanceArgs {
+  MotionShape shape;
+  Strided3<const T> decoded;
+  const T *mean, *std;
+  Strided4<const T> targets;
+  Strided4<const std::uint8_t> mask;
+  Norm norm;
+  ObstacleArgs<T> obstacles;
+  const double* obstacle_scales;  // one a clip
+  T* loss;
+  Strided3<T> gradient;
+};
+
 /// Half-open range of clips; a clip is never split between threads, so sums keep their order.
 struct ClipRange {
   std::int64_t begin, end;
@@ -61,6 +98,9 @@ struct Kernels {
   void (*recover_joints_backward)(const RecoverBackwardArgs<T>&, ClipRange, double* scratch);
   void (*consistency)(const ConsistencyArgs<T>&, ClipRange);
   void (*consistency_backward)(const ConsistencyArgs<T>&, ClipRange);
+  void (*obstacle_loss)(const ObstacleLossArgs<T>&, ClipRange, double* scratch);
+  void (*obstacle_loss_backward)(const ObstacleLossArgs<T>&, ClipRange, double* scratch);
+  void (*guidance)(const GuidanceArgs<T>&, ClipRange, double* scratch);
 };
 
 struct KernelTable {
@@ -86,6 +126,14 @@ static constexpr std::int64_t round_up_to_lanes(std::int64_t n) { return (n + kL
 /// Doubles of scratch memory that the kinematic kernels need: seven time series and four padded rows.
 static constexpr std::int64_t kinematics_scratch(const MotionShape& shape) {
   return 7 * round_up_to_lanes(shape.frames) + 4 * (round_up_to_lanes(3 * shape.joints) + 2 * kLanes);
+}
+
+/// Doubles of scratch memory for the obstacles of sixteen frames.
+static constexpr std::int64_t obstacle_scratch(std::int64_t count) { return count * kObstacleParameters * kLanes; }
+
+/// Doubles of scratch memory for the fused kernel: time series, obstacles, and one flag a joint.
+static constexpr std::int64_t guidance_scratch(const MotionShape& shape, std::int64_t obstacles) {
+  return 7 * round_up_to_lanes(shape.frames) + obstacle_scratch(obstacles) + shape.joints;
 }
 
 const KernelTable& active_kernels();

@@ -25,7 +25,8 @@ CONTROLMM_INLINE Roles<T> roles_from(std::int64_t phase, std::int64_t valid) {
 template <class T>
 struct FrameBlocks {
   explicit FrameBlocks(std::int64_t joints)
-      : values(3 * (joints - 1)), count(round_up_to_lanes(values) / kLanes),
+      : values(3 * (joints - 1)),
+        count(round_up_to_lanes(values) / kLanes),
         roles{roles_from<T>(0, kLanes), roles_from<T>(1, kLanes), roles_from<T>(2, kLanes),
               roles_from<T>((count - 1) * kLanes % 3, values - (count - 1) * kLanes)} {}
 

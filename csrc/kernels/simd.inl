@@ -21,6 +21,14 @@ template <>
 struct IntOf<double> {
   using type = std::int64_t;
 };
+template <>
+struct IntOf<std::int32_t> {
+  using type = std::int32_t;
+};
+template <>
+struct IntOf<std::int64_t> {
+  using type = std::int64_t;
+};
 
 template <class T, int Bytes = kRegisterBytes>
 struct RegisterOf {
@@ -52,9 +60,9 @@ CONTROLMM_INLINE Lanes<R> map_parts(F f, const Lanes<T>& a, const Lanes<U>& b, s
   return {{f(a.part[I], b.part[I])...}};
 }
 
-#define CONTROLMM_LANE_OPERATOR(op)                                                                     \
-  template <class T>                                                                                    \
-  CONTROLMM_INLINE Lanes<T> operator op(const Lanes<T>& a, const Lanes<T>& b) {                         \
+#define CONTROLMM_LANE_OPERATOR(op)                                                                              \
+  template <class T>                                                                                             \
+  CONTROLMM_INLINE Lanes<T> operator op(const Lanes<T>& a, const Lanes<T>& b) {                                  \
     return map_parts<T>([](auto x, auto y) __attribute__((always_inline)) { return x op y; }, a, b, Parts<T>{}); \
   }
 CONTROLMM_LANE_OPERATOR(+)
@@ -67,14 +75,15 @@ CONTROLMM_LANE_OPERATOR(^)
 CONTROLMM_LANE_OPERATOR(>>)
 #undef CONTROLMM_LANE_OPERATOR
 
-#define CONTROLMM_LANE_COMPARISON(op)                                                                   \
-  template <class T>                                                                                    \
-  CONTROLMM_INLINE Mask<T> operator op(const Lanes<T>& a, const Lanes<T>& b) {                          \
-    return map_parts<typename IntOf<T>::type>(                                                          \
-        [](auto x, auto y) __attribute__((always_inline)) { return x op y; }, a, b, Parts<T>{});        \
+#define CONTROLMM_LANE_COMPARISON(op)                                                                                  \
+  template <class T>                                                                                                   \
+  CONTROLMM_INLINE Mask<T> operator op(const Lanes<T>& a, const Lanes<T>& b) {                                         \
+    return map_parts<typename IntOf<T>::type>([](auto x, auto y) __attribute__((always_inline)) { return x op y; }, a, \
+                                              b, Parts<T>{});                                                          \
   }
 CONTROLMM_LANE_COMPARISON(<)
 CONTROLMM_LANE_COMPARISON(>)
+CONTROLMM_LANE_COMPARISON(<=)
 CONTROLMM_LANE_COMPARISON(>=)
 CONTROLMM_LANE_COMPARISON(==)
 #undef CONTROLMM_LANE_COMPARISON
@@ -207,13 +216,32 @@ CONTROLMM_INLINE T sum(const Lanes<T>& a) {
   }
 }
 
-template <class T>
-CONTROLMM_INLINE bool any(const Mask<T>& m) {
-  typename IntOf<T>::type buffer[kLanes];
-  store(buffer, m);
-  typename IntOf<T>::type found = 0;
-  for (auto lane : buffer) found |= lane;
-  return found != 0;
+CONTROLMM_INLINE int sign_bits(RegisterOf<std::int32_t>::type m) {
+#if defined(__AVX512F__)
+  return _mm512_movepi32_mask(reinterpret_cast<__m512i>(m));
+#elif defined(__AVX2__)
+  return _mm256_movemask_ps(reinterpret_cast<__m256>(m));
+#elif defined(__SSE2__)
+  return _mm_movemask_ps(reinterpret_cast<__m128>(m));
+#else
+  return vmaxvq_u32(reinterpret_cast<uint32x4_t>(m)) != 0;
+#endif
+}
+CONTROLMM_INLINE int sign_bits(RegisterOf<std::int64_t>::type m) {
+  return sign_bits(reinterpret_cast<RegisterOf<std::int32_t>::type>(m));
+}
+template <class I, std::size_t... P>
+CONTROLMM_INLINE bool any_part(const Lanes<I>& m, std::index_sequence<P...>) {
+  return (sign_bits(m.part[P]) | ...) != 0;
+}
+// Whether a mask (all bits of a lane alike) has any lane set.
+template <class I>
+CONTROLMM_INLINE bool any(const Lanes<I>& m) {
+  return any_part(m, Parts<I>{});
+}
+template <class I>
+CONTROLMM_INLINE Lanes<I> negated(const Lanes<I>& m) {
+  return m ^ broadcast(I{-1});
 }
 
 CONTROLMM_INLINE Lanes<double> to_double(const Lanes<double>& a) { return a; }

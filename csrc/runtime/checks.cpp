@@ -9,11 +9,16 @@ namespace {
 
 const char* dtype_text(DType dtype) {
   switch (dtype) {
-    case DType::float32: return "float32";
-    case DType::float64: return "float64";
-    case DType::int64: return "int64";
-    case DType::boolean: return "bool";
-    default: return "an unsupported dtype";
+    case DType::float32:
+      return "float32";
+    case DType::float64:
+      return "float64";
+    case DType::int64:
+      return "int64";
+    case DType::boolean:
+      return "bool";
+    default:
+      return "an unsupported dtype";
   }
 }
 
@@ -54,14 +59,18 @@ void require_shape(const TensorView& view, const char* name, std::initializer_li
   if (!fits) refuse(name, "have shape " + shape_text(shape), shape_text(view));
 }
 
-void require_row_major(const TensorView& view, const char* name) {
-  if (view.is_read_only) refuse(name, "be writable", "read-only memory");
+void require_contiguous(const TensorView& view, const char* name) {
   std::int64_t expected = 1;
   for (int i = view.ndim - 1; i >= 0; --i) {
     if (view.size() != 0 && view.shape[i] != 1 && view.strides[i] != expected)
       refuse(name, "be contiguous", "other strides");
     expected *= view.shape[i];
   }
+}
+
+void require_row_major(const TensorView& view, const char* name) {
+  if (view.is_read_only) refuse(name, "be writable", "read-only memory");
+  require_contiguous(view, name);
 }
 
 void require_distinct_elements(const TensorView& view, const char* name) {

@@ -17,6 +17,9 @@ void require_row_major(const TensorView& view, const char* name);
 /// For outputs with free strides: writable, no two elements in one place.
 void require_distinct_elements(const TensorView& view, const char* name);
 
+/// For inputs that the kernels read as a plain array.
+void require_contiguous(const TensorView& view, const char* name);
+
 /// Calls `run(T{})` with float or double for the dtype of the named argument.
 template <class F>
 void for_dtype(const TensorView& view, const char* name, F run) {
@@ -32,6 +35,13 @@ Strided3<T> strided3(const TensorView& v) {
 template <class T>
 Strided4<T> strided4(const TensorView& v) {
   return {static_cast<T*>(v.data), v.strides[0], v.strides[1], v.strides[2], v.strides[3]};
+}
+
+/// Strides for an axis order of the caller's choice, with those of extents of 1 set to 0 so that they broadcast.
+template <class T>
+Strided4<T> broadcast4(const TensorView& v, int clip, int frame, int joint, int coord) {
+  const auto stride = [&](int axis) { return v.shape[axis] == 1 ? 0 : v.strides[axis]; };
+  return {static_cast<T*>(v.data), stride(clip), stride(frame), stride(joint), stride(coord)};
 }
 
 }  // namespace controlmm::checks

@@ -1,7 +1,7 @@
 #include <vector>
 
 #include "checks.h"
-#include "parallel.h"
+#include "clip_work.h"
 
 namespace controlmm {
 namespace {
@@ -14,7 +14,7 @@ ConsistencyArgs<T> checked_args(const TensorView& joints, const TensorView& targ
   checks::require(joints, "joints", 4, joints.dtype);
   checks::require(targets, "targets", 4, joints.dtype);
   checks::require(mask, "mask", 4, DType::boolean);
-  const std::int64_t *s = joints.shape;
+  const std::int64_t* s = joints.shape;
   checks::require_shape(joints, "joints", {s[0], s[1], s[2], 3});
   checks::require_shape(targets, "targets", {s[0], s[1], s[2], 3});
   checks::require_shape(mask, "mask", {s[0], s[1], s[2], 3});
@@ -34,14 +34,7 @@ bool check_per_clip(const TensorView& view, const char* name, std::int64_t clips
   return view.ndim == 1;
 }
 
-template <class Work>
-void run_over_clips(const TensorView& joints, int threads, Work work) {
-  const std::int64_t clips = joints.shape[0];
-  const double work_ns = kNsPerJoint * static_cast<double>(joints.size()) / 3;
-  const int workers = useful_threads(threads, clips, work_ns);
-  if (workers == 1) return work(ClipRange{0, clips});
-  for_clip_ranges(clips, workers, [&](ClipRange range, int) { work(range); });
-}
+double total_ns(const TensorView& joints) { return kNsPerJoint * static_cast<double>(joints.size()) / 3; }
 
 double mean_of(double sum, double count) { return count == 0 ? 0 : sum / count; }
 
@@ -62,7 +55,8 @@ void masked_consistency_loss(const TensorView& joints, const TensorView& targets
     args.sums = totals.data();
     args.counts = totals.data() + clips;
     const auto kernel = active_kernels().of<T>().consistency;
-    if (joints.size() != 0) run_over_clips(joints, threads, [&](ClipRange range) { kernel(args, range); });
+    if (joints.size() != 0)
+      run_over_clips(clips, total_ns(joints), threads, 0, [&](ClipRange range, double*) { kernel(args, range); });
 
     double sum = 0, count = 0;
     for (std::int64_t clip = 0; clip < clips; ++clip) {
@@ -103,7 +97,7 @@ void masked_consistency_loss_backward(const TensorView& joints, const TensorView
     args.scales = scales.data();
     args.grad_joints = grad_joints.as<T>();
     const auto kernel = active_kernels().of<T>().consistency_backward;
-    run_over_clips(joints, threads, [&](ClipRange range) { kernel(args, range); });
+    run_over_clips(clips, total_ns(joints), threads, 0, [&](ClipRange range, double*) { kernel(args, range); });
   });
 }
 

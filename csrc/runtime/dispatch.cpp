@@ -9,9 +9,9 @@
 
 namespace controlmm {
 
-#define CONTROLMM_DECLARE_TABLE(isa)  \
-  namespace isa {                     \
-  extern const KernelTable table;     \
+#define CONTROLMM_DECLARE_TABLE(isa) \
+  namespace isa {                    \
+  extern const KernelTable table;    \
   }
 #if defined(__x86_64__)
 CONTROLMM_DECLARE_TABLE(baseline)
@@ -29,7 +29,9 @@ namespace {
 // Slowest first.
 const KernelTable* const kTables[] = {
 #if defined(__x86_64__)
-    &baseline::table, &avx2::table, &avx512::table,
+    &baseline::table,
+    &avx2::table,
+    &avx512::table,
 #elif defined(__aarch64__)
     &neon::table,
 #else

@@ -1,7 +1,5 @@
-#include <memory>
-
 #include "checks.h"
-#include "parallel.h"
+#include "clip_work.h"
 
 namespace controlmm {
 namespace {
@@ -19,17 +17,8 @@ MotionShape motion_shape(const TensorView& features, std::int64_t joints) {
   return shape;
 }
 
-// Splits the clips over threads and gives each its scratch memory.
-template <class Work>
-void run_over_clips(std::int64_t clips, const MotionShape& shape, int threads, double ns_per_frame, Work work) {
-  const double work_ns = ns_per_frame * static_cast<double>(clips) * static_cast<double>(shape.frames);
-  const int workers = useful_threads(threads, clips, work_ns);
-  const auto share = static_cast<std::size_t>(kinematics_scratch(shape));
-  const std::unique_ptr<double[]> scratch(new double[share * static_cast<std::size_t>(workers)]);
-  if (workers == 1) return work(ClipRange{0, clips}, scratch.get());
-  for_clip_ranges(clips, workers, [&](ClipRange range, int worker) {
-    work(range, scratch.get() + share * static_cast<std::size_t>(worker));
-  });
+double total_ns(const MotionShape& shape, std::int64_t clips, double ns_per_frame) {
+  return ns_per_frame * static_cast<double>(clips * shape.frames);
 }
 
 }  // namespace
@@ -45,13 +34,13 @@ void recover_joints(const TensorView& features, const TensorView& joints, int th
     if (joints.size() == 0) return;
     const RecoverArgs<T> args{shape, checks::strided3<const T>(features), joints.as<T>()};
     const auto kernel = active_kernels().of<T>().recover_joints;
-    run_over_clips(features.shape[0], shape, threads, kForwardNsPerFrame,
-                   [&](ClipRange range, double* scratch) { kernel(args, range, scratch); });
+    run_over_clips(features.shape[0], total_ns(shape, features.shape[0], kForwardNsPerFrame), threads,
+                   kinematics_scratch(shape), [&](ClipRange range, double* scratch) { kernel(args, range, scratch); });
   });
 }
 
-void recover_joints_backward(const TensorView& features, const TensorView& grad_joints,
-                             const TensorView& grad_features, int threads) {
+void recover_joints_backward(const TensorView& features, const TensorView& grad_joints, const TensorView& grad_features,
+                             int threads) {
   checks::for_dtype(features, "features", [&](auto zero) {
     using T = decltype(zero);
     checks::require(features, "features", 3, features.dtype);
@@ -65,8 +54,8 @@ void recover_joints_backward(const TensorView& features, const TensorView& grad_
     const RecoverBackwardArgs<T> args{shape, checks::strided3<const T>(features),
                                       checks::strided4<const T>(grad_joints), checks::strided3<T>(grad_features)};
     const auto kernel = active_kernels().of<T>().recover_joints_backward;
-    run_over_clips(features.shape[0], shape, threads, kBackwardNsPerFrame,
-                   [&](ClipRange range, double* scratch) { kernel(args, range, scratch); });
+    run_over_clips(features.shape[0], total_ns(shape, features.shape[0], kBackwardNsPerFrame), threads,
+                   kinematics_scratch(shape), [&](ClipRange range, double* scratch) { kernel(args, range, scratch); });
   });
 }
 

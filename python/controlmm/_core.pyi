@@ -12,7 +12,9 @@ def available_isas() -> list[str]: ...
 def active_isa() -> str: ...
 def set_isa(name: str, /) -> None: ...
 def recover_joints(features: _Array, joints: _Array, threads: int, /) -> None: ...
-def recover_joints_backward(features: _Array, grad_joints: _Array, grad_features: _Array, threads: int, /) -> None: ...
+def recover_joints_backward(
+    features: _Array, grad_joints: _Array, grad_features: _Array, threads: int, /
+) -> None: ...
 def masked_consistency_loss(
     joints: _Array, targets: _Array, mask: _Array, norm: int, loss: _Array, counts: _Array, threads: int, /
 ) -> None: ...
@@ -24,6 +26,56 @@ def masked_consistency_loss_backward(
     grad_loss: _Array,
     counts: _Array,
     grad_joints: _Array,
+    threads: int,
+    /,
+) -> None: ...
+def obstacle_loss(
+    joints: _Array,
+    kinds: _Array,
+    parameters: _Array,
+    heights: _Array,
+    radii: _Array,
+    is_active: _Array,
+    lengths: _Array,
+    margin: float,
+    is_mean: bool,
+    loss: _Array,
+    threads: int,
+    /,
+) -> None: ...
+def obstacle_loss_backward(
+    joints: _Array,
+    kinds: _Array,
+    parameters: _Array,
+    heights: _Array,
+    radii: _Array,
+    is_active: _Array,
+    lengths: _Array,
+    margin: float,
+    is_mean: bool,
+    grad_loss: _Array,
+    grad_joints: _Array,
+    threads: int,
+    /,
+) -> None: ...
+def guidance_value_and_grad(
+    decoded: _Array,
+    mean: _Array,
+    std: _Array,
+    targets: _Array,
+    mask: _Array,
+    norm: int,
+    kinds: _Array,
+    parameters: _Array,
+    heights: _Array,
+    radii: _Array,
+    is_active: _Array,
+    lengths: _Array,
+    margin: float,
+    is_mean: bool,
+    obstacle_weight: float,
+    loss: _Array,
+    gradient: _Array,
     threads: int,
     /,
 ) -> None: ...

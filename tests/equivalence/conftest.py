@@ -1,4 +1,5 @@
 import pytest
+
 from controlmm import ops
 
 

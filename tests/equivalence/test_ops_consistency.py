@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import pytest
 import torch
+
 from controlmm import ops
 from controlmm.ops.reference import masked_consistency_loss_reference
 
@@ -69,7 +70,9 @@ def test_agrees_with_reference(case, reduction, norm, dtype, isa):
     full_mask = mask if case.per_coordinate else mask[..., None].expand(joints.shape)
 
     actual = value_and_gradients(
-        lambda j, t: ops.masked_consistency_loss(j, t, mask, norm=norm, reduction=reduction, backend="native"),
+        lambda j, t: ops.masked_consistency_loss(
+            j, t, mask, norm=norm, reduction=reduction, backend="native"
+        ),
         joints, targets, cotangent.to(dtype),
     )  # fmt: skip
     expected = value_and_gradients(

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import pytest
 import torch
+
 from controlmm import ops
 from controlmm.ops.reference import recover_joints_reference
 

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+
 from controlmm import ops
 
 GOLDEN = Path(__file__).resolve().parents[3] / "shared" / "reference" / "golden"

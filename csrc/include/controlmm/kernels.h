@@ -26,8 +26,8 @@ void recover_joints(const TensorView& features, const TensorView& joints, int th
 /// Gradient of `recover_joints` with respect to its input.
 /// @param grad_joints   [batch, frames, joints, 3].
 /// @param grad_features [batch, frames, dim], any strides; unused channels become zero.
-void recover_joints_backward(const TensorView& features, const TensorView& grad_joints,
-                             const TensorView& grad_features, int threads = 1);
+void recover_joints_backward(const TensorView& features, const TensorView& grad_joints, const TensorView& grad_features,
+                             int threads = 1);
 
 /// Distance of controlled joints to their targets. An empty mask gives exactly 0.
 /// @param joints, targets [batch, frames, joints, 3]; values outside the mask are never used, NaN included.
@@ -44,5 +44,60 @@ void masked_consistency_loss(const TensorView& joints, const TensorView& targets
 void masked_consistency_loss_backward(const TensorView& joints, const TensorView& targets, const TensorView& mask,
                                       Norm norm, const TensorView& grad_loss, const TensorView& counts,
                                       const TensorView& grad_joints, int threads = 1);
+
+/// Signed-distance primitives. Each is a row of up to `kObstacleParameters` numbers, which may change frame by frame.
+enum class ObstacleKind : std::int64_t {
+  sphere = 0,        ///< center (3), radius
+  capsule = 1,       ///< end a (3), end b (3), radius
+  box = 2,           ///< center (3), half extents (3), rotation matrix from box to world, row-major (9)
+  plane = 3,         ///< unit normal (3), offset: a thin wall; distance |normal . p - offset|
+  half_space = 4,    ///< unit normal (3), offset: solid where normal . p < offset
+  height_field = 5,  ///< x and z of the first sample, spacing in x and z: solid below the bilinear surface; the
+                     ///< distance is vertical, and the border continues outwards
+};
+
+constexpr std::int64_t kObstacleParameters = 16;
+
+/// Obstacles of one call.
+struct Obstacles {
+  TensorView kinds;       ///< int64 [obstacles, 4]: kind; for height fields also first sample, rows (x), columns (z)
+  TensorView parameters;  ///< [batch or 1, obstacles, kObstacleParameters, frames or 1]
+  TensorView heights;     ///< [samples] of all height fields, each row-major [rows, columns]
+};
+
+/// Which joints count against obstacles and how.
+struct Clearance {
+  TensorView radii;      ///< [joints]: each joint is a ball of this radius, in metres
+  TensorView is_active;  ///< boolean [joints]
+  TensorView lengths;    ///< int64 [batch]: frames that count, from the first
+  double margin = 0;     ///< extra clearance in metres (the safe distance d of ControlMM, equation 9)
+  bool is_mean = true;   ///< divide by active joints x counted frames x obstacles
+};
+
+/// Depth by which joints enter the obstacles: sum or mean of max(0, margin + radius - distance).
+/// @param joints [batch, frames, joints, 3].
+/// @param loss   [batch].
+void obstacle_loss(const TensorView& joints, const Obstacles& obstacles, const Clearance& clearance,
+                   const TensorView& loss, int threads = 1);
+
+/// Gradient of `obstacle_loss` with respect to `joints`.
+/// @param grad_loss   [batch].
+/// @param grad_joints [batch, frames, joints, 3], any strides.
+void obstacle_loss_backward(const TensorView& joints, const Obstacles& obstacles, const Clearance& clearance,
+                            const TensorView& grad_loss, const TensorView& grad_joints, int threads = 1);
+
+/// Value and gradient of control and obstacle losses on a decoder's own output, in one pass: de-normalisation,
+/// kinematics and losses, without a tensor of joints. Fastest where frames are contiguous in every argument.
+/// @param decoded   [batch, dim, frames], normalised.
+/// @param mean, std Row-major [dim]: features = decoded * std + mean.
+/// @param targets   [batch, frames, joints, 3] in metres; @param mask boolean of the same shape.
+/// @param obstacle_weight Factor of the obstacle loss; the control loss has factor 1 and is averaged for each clip.
+/// @param loss      [batch].
+/// @param gradient  [batch, dim, frames], any strides. Only channels below 4 + 3 (joints - 1) are written: hand in
+///                  zeros once and the same memory again in later calls.
+void guidance_value_and_grad(const TensorView& decoded, const TensorView& mean, const TensorView& std,
+                             const TensorView& targets, const TensorView& mask, Norm norm, const Obstacles& obstacles,
+                             const Clearance& clearance, double obstacle_weight, const TensorView& loss,
+                             const TensorView& gradient, int threads = 1);
 
 }  // namespace controlmm

@@ -10,15 +10,40 @@ from controlmm.ops.backend import (
     use_isa,
 )
 from controlmm.ops.consistency import masked_consistency_loss
+from controlmm.ops.guidance import frames_last, guidance_value_and_grad
 from controlmm.ops.kinematics import recover_joints
+from controlmm.ops.obstacle_loss import obstacle_loss
+from controlmm.ops.obstacles import (
+    Box,
+    Capsule,
+    HalfSpace,
+    HeightField,
+    Obstacle,
+    PackedObstacles,
+    Plane,
+    Sphere,
+    pack_obstacles,
+)
 
 __all__ = [
     "Backend",
+    "Box",
     "BuildInfo",
+    "Capsule",
+    "HalfSpace",
+    "HeightField",
+    "Obstacle",
+    "PackedObstacles",
+    "Plane",
+    "Sphere",
     "active_isa",
     "available_isas",
     "build_info",
+    "frames_last",
+    "guidance_value_and_grad",
     "masked_consistency_loss",
+    "obstacle_loss",
+    "pack_obstacles",
     "recover_joints",
     "use_backend",
     "use_isa",

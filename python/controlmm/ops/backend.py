@@ -115,7 +115,8 @@ def runs_native(backend: Backend | None, *tensors: Tensor) -> bool:
 
 
 def available_isas() -> tuple[str, ...]:
-    """Instruction sets the kernels were built for and this processor runs, slowest first; empty without extension."""
+    """Instruction sets the kernels were built for and this processor runs, slowest first; empty without
+    extension."""
     return tuple(_core.available_isas()) if _core is not None else ()
 
 

@@ -64,9 +64,7 @@ def check_consistency_arguments(joints: Tensor, targets: Tensor, mask: Tensor, n
     if norm not in NORM_CODES:
         raise ValueError(f"`norm` must be one of {tuple(NORM_CODES)}, got {norm!r}.")
     if not joints.is_floating_point() or targets.dtype != joints.dtype:
-        raise TypeError(
-            f"`joints` and `targets` must share one floating-point dtype, got {joints.dtype} and {targets.dtype}."
-        )
+        raise TypeError(fX)
     if joints.ndim != 4 or joints.shape[-1] != 3 or targets.shape != joints.shape:
         raise ValueError(
             "`joints` and `targets` must both have shape (B, T, J, 3), "
@@ -76,7 +74,8 @@ def check_consistency_arguments(joints: Tensor, targets: Tensor, mask: Tensor, n
         raise TypeError(f"`mask` must be boolean, got {mask.dtype}. Use `mask > 0` or `.bool()`.")
     if mask.shape not in (joints.shape, joints.shape[:3]):
         raise ValueError(
-            f"`mask` must have shape {tuple(joints.shape[:3])} or {tuple(joints.shape)}, got {tuple(mask.shape)}."
+            f"`mask` must have shape {tuple(joints.shape[:3])} or {tuple(joints.shape)}, "
+            f"got {tuple(mask.shape)}."
         )
 
 
@@ -85,7 +84,8 @@ def _consistency_native(
 ) -> Tensor:
     needs_gradient = torch.is_grad_enabled() and (joints.requires_grad or targets.requires_grad)
     if needs_gradient:
-        return _MaskedConsistency.apply(joints, targets, mask, norm, reduction)  # type: ignore[no-any-return]
+        result: Tensor = _MaskedConsistency.apply(joints, targets, mask, norm, reduction)
+        return result
     return consistency_forward(joints, targets, mask, norm, reduction)[0]
 
 
@@ -124,7 +124,7 @@ class _MaskedConsistency(torch.autograd.Function):
         return loss
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
+    @once_differentiable
     def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor | None, Tensor | None, None, None, None]:
         joints, targets, mask, counts = ctx.saved_tensors
         grad = consistency_backward(joints, targets, mask, ctx.norm, grad_loss, counts)

@@ -21,7 +21,8 @@ def recover_joints(
     Frame 0 has its root at x = z = 0 and faces +Z. Sums along time run in double precision.
 
     Args:
-        features: De-normalised features with D >= 4 + 3 (J - 1); channels past that are not read. Any strides.
+        features: De-normalised features with D >= 4 + 3 (J - 1); channels past that are not read. Any
+            strides.
         joints: 22 for HumanML3D, 21 for KIT (positions are then in millimetres, as its features are).
         backend: "native", "reference" or "auto"; ``None`` asks the context and the environment.
 
@@ -55,7 +56,8 @@ def _check_features(features: Tensor, joints: int) -> None:
 
 def _recover_joints_native(features: Float[Tensor, "B T D"], joints: int) -> Float[Tensor, "B T J 3"]:
     if features.requires_grad and torch.is_grad_enabled():
-        return _RecoverJoints.apply(features, joints)  # type: ignore[no-any-return]
+        result: Tensor = _RecoverJoints.apply(features, joints)
+        return result
     return recover_joints_forward(features, joints)
 
 
@@ -82,7 +84,7 @@ class _RecoverJoints(torch.autograd.Function):
         return recover_joints_forward(features, joints)
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
+    @once_differentiable
     def backward(ctx: Any, grad_joints: Tensor) -> tuple[Tensor, None]:
         (features,) = ctx.saved_tensors
         return recover_joints_backward(features, grad_joints), None

@@ -12,8 +12,8 @@ def recover_joints_reference(
 ) -> Float[Tensor, "*B T J 3"]:
     """Global joint positions of de-normalised HumanML3D features.
 
-    Channel 0 is half the yaw velocity, 1-2 the root velocity in the heading frame of the next frame, 3 the root
-    height, then joints 1..J-1 relative to the root (x, z) in the heading frame, y absolute.
+    Channel 0 is half the yaw velocity, 1-2 the root velocity in the heading frame of the next frame, 3 the
+    root height, then joints 1..J-1 relative to the root (x, z) in the heading frame, y absolute.
     """
     half_turn = features[..., :-1, 0].cumsum(-1)
     yaw = 2 * torch.cat([torch.zeros_like(features[..., :1, 0]), half_turn], dim=-1)  # (B, T)
@@ -38,10 +38,11 @@ def masked_consistency_loss_reference(
     norm: str = "l2",
     reduction: str = "batch",
 ) -> Float[Tensor, ""] | Float[Tensor, "B"]:
-    """Distance of controlled joints to their targets (ControlMM, equation 4; also absolute and squared error)."""
+    """Distance of controlled joints to their targets (ControlMM, equation 4), or absolute or squared
+    error."""
     difference = torch.where(mask, joints - targets, 0)
     if norm == "l2":
-        penalty = _length(difference)
+        penalty = vector_length(difference)
         count = mask.any(-1).sum((1, 2))
     else:
         penalty = difference.abs() if norm == "l1" else difference.square()
@@ -53,7 +54,7 @@ def masked_consistency_loss_reference(
     return total / count.clamp(min=1)
 
 
-def _length(vectors: Float[Tensor, "*S 3"]) -> Float[Tensor, "*S"]:
+def vector_length(vectors: Float[Tensor, "*S 3"]) -> Float[Tensor, "*S"]:
     """Euclidean length whose gradient at zero is zero, not NaN."""
     squared = vectors.square().sum(-1)
     is_zero = squared == 0
