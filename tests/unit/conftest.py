@@ -15,12 +15,15 @@ _DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 # Offsets of a made-up body in its T-pose, metres: hips and collars oblique, as real ones are.
 _OFFSETS = {
-    "left_hip": (0.06, -0.08, -0.01), "right_hip": (-0.07, -0.08, -0.01), "spine1": (0.0, 0.12, -0.02),
-    "left_knee": (0, -0.4, 0), "right_knee": (0, -0.4, 0), "spine2": (0, 0.14, 0), "left_ankle": (0, -0.42, 0),
-    "right_ankle": (0, -0.42, 0), "spine3": (0, 0.06, 0), "left_foot": (0, -0.06, 0.13),
-    "right_foot": (0, -0.06, 0.13), "neck": (0, 0.22, -0.02), "left_collar": (0.07, 0.12, -0.02),
-    "right_collar": (-0.08, 0.12, -0.02), "head": (0, 0.08, 0.06), "left_shoulder": (0.13, 0, 0),
-    "right_shoulder": (-0.12, 0, 0), "left_elbow": (0.26, 0, 0), "right_elbow": (-0.26, 0, 0),
+    "left_hip": (0.06, -0.08, -0.01), "right_hip": (-0.07, -0.08, -0.01),
+    "left_knee": (0, -0.4, 0), "right_knee": (0, -0.4, 0),
+    "left_ankle": (0, -0.42, 0), "right_ankle": (0, -0.42, 0),
+    "left_foot": (0, -0.06, 0.13), "right_foot": (0, -0.06, 0.13),
+    "spine1": (0, 0.12, -0.02), "spine2": (0, 0.14, 0), "spine3": (0, 0.06, 0),
+    "neck": (0, 0.22, -0.02), "head": (0, 0.08, 0.06),
+    "left_collar": (0.07, 0.12, -0.02), "right_collar": (-0.08, 0.12, -0.02),
+    "left_shoulder": (0.13, 0, 0), "right_shoulder": (-0.12, 0, 0),
+    "left_elbow": (0.26, 0, 0), "right_elbow": (-0.26, 0, 0),
     "left_wrist": (0.25, 0, 0), "right_wrist": (-0.25, 0, 0),
 }  # fmt: skip
 
@@ -36,7 +39,7 @@ def _turn(axis: int, angle: np.ndarray) -> np.ndarray:
 
 
 def _walking_rotations(frames: int) -> dict[str, np.ndarray]:
-    """Local rotations of a walk along a slight curve: hinges for knees and elbows, arms that hang and swing."""
+    """Local rotations of a walk along a curve: hinges for knees and elbows, arms that hang and swing."""
     phase = 2 * np.pi * np.arange(frames) / 22
     one = np.ones(frames)
     return {
@@ -55,11 +58,12 @@ def _walking_rotations(frames: int) -> dict[str, np.ndarray]:
 
 
 def walking_joints(frames: int) -> torch.Tensor:
-    """(T, 22, 3) float64 joints in metres of a rigid body that walks, by forward kinematics written out here."""
+    """(T, 22, 3) float64 joints in metres of a rigid body that walks, by its own forward kinematics."""
     local = _walking_rotations(frames)
     identity = np.tile(np.eye(3), (frames, 1, 1))
     phase = 2 * np.pi * np.arange(frames) / 22
-    root = np.stack([0.1 * np.sin(phase / 3), 0.93 + 0.02 * np.cos(2 * phase), 0.055 * np.arange(frames)], axis=1)
+    height = 0.93 + 0.02 * np.cos(2 * phase)
+    root = np.stack([0.1 * np.sin(phase / 3), height, 0.055 * np.arange(frames)], axis=1)
     positions, rotations = [root], [local["pelvis"]]
     for name, parent in zip(HUMANML3D.joint_names[1:], HUMANML3D.parents[1:], strict=True):
         positions.append(positions[parent] + rotations[parent] @ np.array(_OFFSETS[name], dtype=np.float64))
@@ -75,7 +79,7 @@ def walking() -> Motion:
 
 @pytest.fixture
 def controlled_walking(walking: Motion) -> Motion:
-    """The walk with a ground path for the pelvis (height free) and three targets for the right wrist, 3 cm off."""
+    """The walk with a ground path for the pelvis (height free) and three wrist targets, 3 cm off."""
     targets = torch.full_like(walking.joints, torch.nan)
     mask = torch.zeros(walking.joints.shape, dtype=torch.bool)
     mask[:, 0, [0, 2]] = True

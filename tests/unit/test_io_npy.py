@@ -81,6 +81,7 @@ BAD = {
     "text": (raw(b"hello"), DAMAGED),
     "empty": (raw(b""), DAMAGED),
     "huge header": (raw(HUGE_HEADER), DAMAGED),
+    "open bracket in the header": (raw(HUGE_HEADER.replace(b")", b" ")), DAMAGED),
 }
 
 

@@ -13,8 +13,6 @@ from controlmm.io.atomic import replaced_on_success
 from controlmm.motion.motion import Motion
 from controlmm.motion.skeleton import SKELETONS
 
-_DAMAGE = (OSError, EOFError, ValueError, MemoryError, SyntaxError)
-
 
 class NpyFormat:
     """Reader and writer of ``.npy``: (T, 263) or (T, 251) features, or (T, 22, 3) or (T, 21, 3) joints."""
@@ -57,9 +55,9 @@ def _read(path: Path) -> ndarray:
     try:
         with path.open("rb") as file:
             return np.lib.format.read_array(file, allow_pickle=False)
-    except FileNotFoundError:
+    except (FileNotFoundError, PermissionError):
         raise
-    except _DAMAGE as error:
+    except Exception as error:  # NumPy's header parser lets through whatever Python's tokenizer raises
         reason = " ".join(str(error).split())[:100]
         raise ValueError(f"{path}: damaged or not a NumPy array ({reason}).") from None
 
