@@ -12,7 +12,7 @@ from controlmm.viewer.scene import Scene
 from controlmm.viewer.stick_figure import StickFigure
 from controlmm.viewer.target_style import target_color, target_marker, traced_joints
 
-_TAIL_SECONDS = 0.4  # of the trail that a controlled joint draws behind itself
+_TAIL_SECONDS = 0.2  # of the trail that a controlled joint draws behind itself
 _GAP = 0.12  # metres between neighbouring figures
 
 
