@@ -53,6 +53,9 @@ def prepare(
     """Turn joint positions into a folder in HumanML3D's layout, to train on."""
     from controlmm.data import write_folder
 
+    for folder in (packs, joints):
+        if folder is not None and not folder.is_dir():  # before anything is written
+            raise FileNotFoundError(f"No folder at {folder}.")
     clips = _clips(packs, joints, sources)
     count = write_folder(
         clips,

@@ -1,0 +1,199 @@
+"""``controlmm generate`` on a tiny model: what it writes, what it prints, what it refuses."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from controlmm.cli.generate import slug
+from controlmm.controls import ControlFile, PathControl, save_controls
+from controlmm.evaluation import foot_skating_ratio
+from controlmm.motion.motion import Motion
+
+SECONDS, FRAMES = 0.8, 16
+PROMPT = "a person walks forward"
+CENTIMETRE = 0.01
+PRINTED = 0.006  # centimetres; errors are printed with two digits
+
+Command = Callable[..., str]
+
+
+@pytest.fixture
+def walk_line(tmp_path: Path) -> Path:
+    """A short straight way for the pelvis, with its own prompt and length."""
+    path = PathControl("pelvis", xz=[[0.0, 0.0], [0.0, 0.5]])
+    return save_controls(ControlFile([path], seconds=SECONDS, text=PROMPT), tmp_path / "line.json")
+
+
+def test_writes_every_format_of_every_sample_and_prints_a_row_for_each(
+    command: Command, tiny_pipeline_folder: Path, walk_line: Path, tmp_path: Path
+) -> None:
+    printed = command(
+        "generate", PROMPT, "--seconds", SECONDS, "--controls", walk_line, "--preset", "fast", "--samples", 2,
+        "--seed", 3, "--formats", "npz,bvh,png", "--out", tmp_path / "out", "--model", tiny_pipeline_folder,
+    )  # fmt: skip
+    names = [f"a-person-walks-forward_3_{i}.{suffix}" for i in (0, 1) for suffix in ("npz", "bvh", "png")]
+    lines = printed.splitlines()
+    assert lines[-6:] == [str(tmp_path / "out" / name) for name in names]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(names)
+    for index, row in enumerate(line.split() for line in lines[2:4]):
+        motion = Motion.load(tmp_path / "out" / names[3 * index])
+        assert motion.num_frames == FRAMES
+        distance = (motion.joints - motion.extra["targets"])[:, 0, [0, 2]].norm(dim=-1).mean().item()
+        assert float(row[1]) == pytest.approx(distance / CENTIMETRE, abs=PRINTED)
+        assert row[2] == f"{foot_skating_ratio(motion.joints[None]).item():.3f}"
+        assert row[0] == str(index)
+        assert float(row[3]) > 0
+        assert float(row[4]) > 0
+
+
+def test_prompt_and_length_come_from_the_control_file_when_not_given(
+    command: Command, tiny_pipeline_folder: Path, walk_line: Path, tmp_path: Path
+) -> None:
+    printed = command(
+        "generate", "--controls", walk_line, "--preset", "fast", "--formats", "npz", "--out", tmp_path,
+        "--model", tiny_pipeline_folder, "--quiet",
+    )  # fmt: skip
+    assert printed == f"{tmp_path / 'a-person-walks-forward_0_0.npz'}\n"
+    motion = Motion.load(printed.strip())
+    assert (motion.text, motion.num_frames) == (PROMPT, FRAMES)
+
+
+def test_the_seed_decides_the_motion_and_text_alone_has_no_control_error(
+    command: Command, tiny_pipeline_folder: Path, tmp_path: Path
+) -> None:
+    def joints(seed: int, folder: str) -> torch.Tensor:
+        printed = command(
+            "generate", "turn", "--seconds", SECONDS, "--seed", seed, "--formats", "npz", "--out",
+            tmp_path / folder, "--model", tiny_pipeline_folder, "--preset", "fast", "--guidance", 2,
+        )  # fmt: skip
+        assert printed.splitlines()[2].split()[1] == "-"
+        return Motion.load(tmp_path / folder / f"turn_{seed}_0.npz").joints
+
+    first = joints(1, "a")
+    assert torch.equal(first, joints(1, "b"))
+    assert not torch.equal(first, joints(2, "a"))
+
+
+@pytest.mark.parametrize(
+    ("prompt", "expected"),
+    [
+        ("A person, walking!", "a-person-walking"),
+        ("../../etc/passwd", "etc-passwd"),
+        ("word " * 30, "word-word-word-word-word-word-word-word-word"),
+        ("...", "motion"),
+        ("x" * 60, "x" * 48),
+    ],
+)
+def test_file_names_are_made_of_the_prompts_words(prompt: str, expected: str) -> None:
+    assert slug(prompt) == expected
+
+
+_HEADER = {"version": 1, "units": "m", "up": "y", "fps": 20}
+
+
+def _joint_control(joint: str, frame: int, x: float) -> str:
+    control = {"type": "joint", "joint": joint, "frames": [0, frame], "positions": [[0, 0.9, 0], [x, 0.9, 0]]}
+    return json.dumps({**_HEADER, "prompt": PROMPT, "seconds": 6.0, "controls": [control]})
+
+
+BAD_FILES = {
+    "unknown joint": ("tail.json", _joint_control("tail", 1, 0.0), r'Unknown joint "tail"'),
+    "frame after the end": (
+        "late.json",
+        _joint_control("pelvis", 400, 0.0),
+        r"\(pelvis\) names frame 400, but the clip has 120 frames",
+    ),
+    "NaN target": (
+        "nan.json",
+        _joint_control("pelvis", 1, float("nan")),
+        r"controls\[0\]\.positions\[1\]: must be a finite number, got NaN",
+    ),
+    "NaN in a table": ("nan.csv", "frame,joint,x,y,z\n0,pelvis,nan,0.9,0\n", r"must be finite, got \(nan"),
+    "broken JSON": ("broken.json", '{"version": 1, ', r"broken JSON at line 1, column 16"),
+    "too long": (
+        "long.json",
+        _joint_control("pelvis", 1, 0.0).replace('"seconds": 6.0', '"seconds": 12'),
+        r"is 12 s long, a motion is at most 9\.8 s",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD_FILES)
+def test_bad_control_files_are_refused_in_one_line(
+    case: str, refused: Command, tiny_pipeline_folder: Path, tmp_path: Path
+) -> None:
+    name, content, pattern = BAD_FILES[case]
+    (tmp_path / name).write_text(content)
+    message = refused(
+        "generate", "a person stands", "--controls", tmp_path / name, "--model", tiny_pipeline_folder,
+        "--out", tmp_path / "out", "--quiet",
+    )  # fmt: skip
+    assert _matches(pattern, message)
+    assert not (tmp_path / "out").exists()
+
+
+BAD_OPTIONS = {
+    "empty prompt": (["  "], r"`prompt` is empty"),
+    "no prompt": ([], r"Give a prompt"),
+    "missing model folder": (["walk", "--model", "nowhere"], r"No model folder at nowhere"),
+    "missing control file": (["walk", "--controls", "nowhere.json"], r"No control file at nowhere\.json"),
+    "unknown preset": (["walk", "--preset", "best"], r"Unknown `preset` 'best'.*fast"),
+    "unknown format": (["walk", "--formats", "npz,fbx"], r"`--formats` must name some of .*bvh.*'npz,fbx'"),
+    "no format": (["walk", "--formats", ","], r"`--formats` must name some of"),
+    "too long": (["walk", "--seconds", "11"], r"`seconds` must be between 0\.4 and 9\.8, got 11"),
+    "no samples": (["walk", "--samples", "0"], r"`samples` must be a whole number of at least 1"),
+    "negative seed": (["walk", "--seed", "-1"], r"`seed` must be a whole number of at least 0"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_OPTIONS)
+def test_bad_options_are_refused_in_one_line(
+    case: str, refused: Command, tiny_pipeline_folder: Path, tmp_path: Path
+) -> None:
+    arguments, pattern = BAD_OPTIONS[case]
+    model = [] if "--model" in arguments else ["--model", tiny_pipeline_folder]
+    assert _matches(pattern, refused("generate", *arguments, *model, "--out", tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("part", ["tokenizer", "transformer", "residual", "control"])
+def test_truncated_weights_are_named(
+    part: str, refused: Command, tiny_pipeline_folder: Path, tmp_path: Path
+) -> None:
+    model = shutil.copytree(tiny_pipeline_folder, tmp_path / "model")
+    weights = model / part / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-100])
+    message = refused("generate", "walk", "--model", model)
+    assert f"{weights} is damaged or truncated" in message
+
+
+def test_debug_shows_the_traceback() -> None:
+    from typer.testing import CliRunner
+
+    from controlmm.cli.main import app
+
+    result = CliRunner().invoke(app, ["--debug", "generate", "walk", "--formats", "fbx"])
+    assert isinstance(result.exception, ValueError)
+
+
+def test_a_dense_array_sets_the_length(command: Command, tiny_pipeline_folder: Path, tmp_path: Path) -> None:
+    positions = np.full((FRAMES, 22, 3), np.nan, dtype=np.float32)
+    positions[:, 0] = [0.0, 0.9, 0.0]
+    np.save(tmp_path / "dense.npy", positions)
+    command(
+        "generate", "stand", "--controls", tmp_path / "dense.npy", "--preset", "fast", "--formats", "npz",
+        "--out", tmp_path, "--model", tiny_pipeline_folder,
+    )  # fmt: skip
+    assert Motion.load(tmp_path / "stand_0_0.npz").num_frames == FRAMES
+
+
+def _matches(pattern: str, message: str) -> bool:
+    return re.search(pattern, message) is not None
