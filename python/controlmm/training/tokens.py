@@ -20,6 +20,7 @@ MIN_FRAMES, MAX_FRAMES = 40, 199  # of clips used for the transformers (KIT-ML: 
 _ENCODE_BATCH = 64
 _DROP_UNIT = 1 / 3  # share of samples that are one token shorter than they could be
 _LONGEST = 196
+_LENGTH_BAND = 0.15  # the clips of a batch differ from the first in length by at most this share
 
 
 @dataclass(frozen=True)
@@ -79,13 +80,20 @@ class TokenSampler:
         self._ids = _tokenize(self._features, tokenizer, progress=progress)
         sources = [clips[item.clip].source for item in self._items]
         self._weights = source_weights(sources, [1] * len(self._items))
+        self._frames = torch.tensor([item.end - item.start for item in self._items])
 
     def __len__(self) -> int:
         return len(self._items)
 
     def sample(self, count: int) -> TokenBatch:
-        """``count`` random crops from torch's global random state."""
-        chosen = torch.multinomial(self._weights, count, replacement=True).tolist()
+        """``count`` random crops of about the same length, from torch's global random state.
+
+        A first item is drawn freely and the others near its length, which keeps every item's share nearly
+        as it was and spends little on padding.
+        """
+        first = self._frames[torch.multinomial(self._weights, 1)]
+        is_near = (self._frames - first).abs() <= _LENGTH_BAND * first
+        chosen = torch.multinomial(self._weights * is_near, count, replacement=True).tolist()
         return self._collate([self._random_crop(self._items[index]) for index in chosen])
 
     def whole(self, indices: Sequence[int]) -> TokenBatch:
