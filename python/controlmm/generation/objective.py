@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controlmm.generation.motion_decoder import MotionDecoder
-from controlmm.ops import masked_consistency_loss
+from controlmm.ops import frames_last, guidance_value_and_grad, masked_consistency_loss
 
 
 class Objective(Protocol):
@@ -39,19 +39,29 @@ class ControlObjective:
         frames: Bool[Tensor, "B T"],
     ) -> None:
         self.decoder = decoder
-        self.targets, self.mask = targets, mask
+        self.targets, self.mask = frames_last(targets), frames_last(mask)
         self.frames = None if frames.all() else frames
+        self._gradient: Tensor | None = None  # of the decoder's output, written again at every evaluation
 
     def value_and_gradient(
         self, latents: Float[Tensor, "B L C"]
     ) -> tuple[Float[Tensor, "B"], Float[Tensor, "B L C"]]:
         """See :class:`Objective`."""
+        statistics = self.decoder.normalizer
         with torch.enable_grad():
             latents = latents.detach().requires_grad_()
-            joints = self.decoder(latents, self.frames)
-            loss = masked_consistency_loss(joints, self.targets, self.mask, norm="mse", reduction="clip")
-            (gradient,) = torch.autograd.grad(loss.sum(), latents)
-        return loss.detach(), gradient
+            decoded = self.decoder.tokenizer.decode_channels(latents, self.frames)
+        loss, self._gradient = guidance_value_and_grad(
+            decoded.detach(),
+            self.targets,
+            self.mask,
+            mean=statistics.mean,
+            std=statistics.std,
+            norm="mse",
+            out=self._gradient,
+        )
+        (gradient,) = torch.autograd.grad(decoded, latents, self._gradient)
+        return loss, gradient
 
 
 def control_error(
