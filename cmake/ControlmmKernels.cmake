@@ -8,6 +8,7 @@ add_library(controlmm_kernels STATIC
   ${csrc}/runtime/cpu_features.cpp
   ${csrc}/runtime/dispatch.cpp
   ${csrc}/runtime/guidance.cpp
+  ${csrc}/runtime/gumbel.cpp
   ${csrc}/runtime/kinematics.cpp
   ${csrc}/runtime/obstacle_arguments.cpp
   ${csrc}/runtime/obstacles.cpp

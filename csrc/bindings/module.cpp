@@ -87,6 +87,26 @@ void register_kernels(Module& m) {
                                 gradient.view(), threads);
       },
       Unlocked());
+  m.def(
+      "gumbel_noise",
+      [](std::uint64_t seed, std::int64_t first_clip, Arg noise, int threads) {
+        gumbel_noise({seed, first_clip}, noise.view(), threads);
+      },
+      Unlocked());
+  m.def(
+      "gumbel_straight_through",
+      [](Arg logits, Arg codebook, double temperature, std::uint64_t seed, std::int64_t first_clip, Arg ids,
+         Arg embeddings, Arg probabilities, int threads) {
+        gumbel_straight_through(logits.view(), codebook.view(), temperature, {seed, first_clip}, ids.view(),
+                                embeddings.view(), probabilities.view(), threads);
+      },
+      Unlocked());
+  m.def(
+      "softmax_backward",
+      [](Arg probabilities, double temperature, Arg gradient, int threads) {
+        softmax_backward(probabilities.view(), temperature, gradient.view(), threads);
+      },
+      Unlocked());
 }
 
 }  // namespace

@@ -28,12 +28,16 @@ namespace {
 #include "consistency.inl"
 #include "obstacles.inl"
 #include "guidance.inl"
+#include "philox.inl"
+#include "exponential.inl"
+#include "gumbel.inl"
 // clang-format on
 
 template <class T>
 constexpr Kernels<T> kernels() {
   return {&recover_joints<T>, &recover_joints_backward<T>, &consistency<T>, &consistency_backward<T>,
-          &obstacle_loss<T>,  &obstacle_loss_backward<T>,  &guidance<T>};
+          &obstacle_loss<T>,  &obstacle_loss_backward<T>,  &gumbel<T>,      &softmax_backward<T>,
+          &guidance<T>};
 }
 
 }  // namespace

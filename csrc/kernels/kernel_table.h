@@ -87,6 +87,27 @@ struct GuidanceArgs {
   Strided3<T> gradient;
 };
 
+template <class T>
+struct GumbelArgs {
+  std::int64_t tokens, codes, channels;
+  const T* logits;  // null draws bare noise into `probabilities`
+  std::int64_t clip_stride, token_stride;
+  const T* codebook;
+  T temperature;
+  NoiseSource source;
+  std::int64_t* ids;
+  T* embeddings;
+  T* probabilities;  // may be null
+};
+
+template <class T>
+struct SoftmaxArgs {
+  std::int64_t codes;
+  const T* probabilities;
+  T inverse_temperature;
+  T* gradient;
+};
+
 /// Half-open range of clips; a clip is never split between threads, so sums keep their order.
 struct ClipRange {
   std::int64_t begin, end;
@@ -100,6 +121,8 @@ struct Kernels {
   void (*consistency_backward)(const ConsistencyArgs<T>&, ClipRange);
   void (*obstacle_loss)(const ObstacleLossArgs<T>&, ClipRange, double* scratch);
   void (*obstacle_loss_backward)(const ObstacleLossArgs<T>&, ClipRange, double* scratch);
+  void (*gumbel)(const GumbelArgs<T>&, ClipRange rows);
+  void (*softmax_backward)(const SoftmaxArgs<T>&, ClipRange rows);
   void (*guidance)(const GuidanceArgs<T>&, ClipRange, double* scratch);
 };
 

@@ -26,6 +26,10 @@ struct IntOf<std::int32_t> {
   using type = std::int32_t;
 };
 template <>
+struct IntOf<std::uint32_t> {
+  using type = std::int32_t;
+};
+template <>
 struct IntOf<std::int64_t> {
   using type = std::int64_t;
 };

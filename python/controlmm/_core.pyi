@@ -79,3 +79,19 @@ def guidance_value_and_grad(
     threads: int,
     /,
 ) -> None: ...
+def gumbel_noise(seed: int, first_clip: int, noise: _Array, threads: int, /) -> None: ...
+def gumbel_straight_through(
+    logits: _Array,
+    codebook: _Array,
+    temperature: float,
+    seed: int,
+    first_clip: int,
+    ids: _Array,
+    embeddings: _Array,
+    probabilities: _Array,
+    threads: int,
+    /,
+) -> None: ...
+def softmax_backward(
+    probabilities: _Array, temperature: float, gradient: _Array, threads: int, /
+) -> None: ...

@@ -154,3 +154,20 @@ def test_every_instruction_set_gives_the_same_bits():
     for result in results[1:]:
         for mine, first in zip(result, results[0], strict=True):
             assert torch.equal(mine, first)
+
+
+@pytest.mark.parametrize("backend", ["native", "reference"])
+def test_impossible_arguments_are_refused(backend):
+    joints, targets, mask = Case("small").arguments(torch.float32)
+    with pytest.raises(TypeError, match=r"`mask` must be boolean, got torch.float32"):
+        ops.masked_consistency_loss(joints, targets, mask.float(), backend=backend)
+    with pytest.raises(TypeError, match="`joints` and `targets` must share one floating-point dtype"):
+        ops.masked_consistency_loss(joints, targets.double(), mask, backend=backend)
+    with pytest.raises(ValueError, match=r"must both have shape \(B, T, J, 3\)"):
+        ops.masked_consistency_loss(joints[0], targets[0], mask, backend=backend)
+    with pytest.raises(ValueError, match=r"`mask` must have shape \(3, 11, 22\) or \(3, 11, 22, 3\)"):
+        ops.masked_consistency_loss(joints, targets, mask[:, 1:], backend=backend)
+    with pytest.raises(ValueError, match=r"`norm` must be one of"):
+        ops.masked_consistency_loss(joints, targets, mask, norm="l3", backend=backend)
+    with pytest.raises(ValueError, match=r"`reduction` must be one of"):
+        ops.masked_consistency_loss(joints, targets, mask, reduction="none", backend=backend)

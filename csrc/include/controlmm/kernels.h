@@ -100,4 +100,33 @@ void guidance_value_and_grad(const TensorView& decoded, const TensorView& mean, 
                              const Clearance& clearance, double obstacle_weight, const TensorView& loss,
                              const TensorView& gradient, int threads = 1);
 
+/// Place of a draw in the noise: a function of these and the position only, so that threads and batch splits agree.
+struct NoiseSource {
+  std::uint64_t seed = 0;
+  std::int64_t first_clip = 0;  ///< number of the first clip of this call in the whole batch
+};
+
+/// Standard Gumbel noise -log(-log(u)), u from Philox 4x32-10 (Salmon et al. 2011).
+/// Element (b, l, k) takes word (k mod 64) / 16 of the block with counter
+/// (16 floor(k / 64) + k mod 16, l, first_clip + b, 0) and key = seed; u = (floor(word / 512) + 1/2) / 2^23.
+/// @param noise Row-major [batch, tokens, codes].
+void gumbel_noise(NoiseSource source, const TensorView& noise, int threads = 1);
+
+/// Draws one code for each token, argmax(logits + noise), and copies its row of the codebook.
+/// @param logits        [batch, tokens, codes], codes contiguous.
+/// @param codebook      Row-major [codes, channels].
+/// @param temperature   Of the soft probabilities, above 0; the drawn codes do not depend on it.
+/// @param ids           Row-major int64 [batch, tokens].
+/// @param embeddings    Row-major [batch, tokens, channels]; no channels skips the copy.
+/// @param probabilities Row-major [batch, tokens, codes], softmax((logits + noise) / temperature); or no codes, if
+///                      they are not wanted.
+void gumbel_straight_through(const TensorView& logits, const TensorView& codebook, double temperature,
+                             NoiseSource source, const TensorView& ids, const TensorView& embeddings,
+                             const TensorView& probabilities, int threads = 1);
+
+/// Gradient of the soft probabilities with respect to the logits.
+/// @param probabilities Row-major [rows, codes].
+/// @param gradient      Row-major [rows, codes]: on entry the gradient of the probabilities, on return of the logits.
+void softmax_backward(const TensorView& probabilities, double temperature, const TensorView& gradient, int threads = 1);
+
 }  // namespace controlmm

@@ -11,6 +11,7 @@ from controlmm.ops.backend import (
 )
 from controlmm.ops.consistency import masked_consistency_loss
 from controlmm.ops.guidance import frames_last, guidance_value_and_grad
+from controlmm.ops.gumbel import gumbel_noise, gumbel_straight_through
 from controlmm.ops.kinematics import recover_joints
 from controlmm.ops.obstacle_loss import obstacle_loss
 from controlmm.ops.obstacles import (
@@ -41,6 +42,8 @@ __all__ = [
     "build_info",
     "frames_last",
     "guidance_value_and_grad",
+    "gumbel_noise",
+    "gumbel_straight_through",
     "masked_consistency_loss",
     "obstacle_loss",
     "pack_obstacles",

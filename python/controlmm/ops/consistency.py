@@ -64,7 +64,8 @@ def check_consistency_arguments(joints: Tensor, targets: Tensor, mask: Tensor, n
     if norm not in NORM_CODES:
         raise ValueError(f"`norm` must be one of {tuple(NORM_CODES)}, got {norm!r}.")
     if not joints.is_floating_point() or targets.dtype != joints.dtype:
-        raise TypeError(fX)
+        "`joints` and `targets` must share one floating-point dtype, "
+        f"got {joints.dtype} and {targets.dtype}."
     if joints.ndim != 4 or joints.shape[-1] != 3 or targets.shape != joints.shape:
         raise ValueError(
             "`joints` and `targets` must both have shape (B, T, J, 3), "

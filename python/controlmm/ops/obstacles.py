@@ -127,9 +127,8 @@ class Box:
         excess = (turn.detach().mT @ turn.detach() - torch.eye(3, dtype=turn.dtype)).abs().max().item()
         if excess > 1e-3:
             raise ValueError(
-                f"`rotation` must be orthonormal, got a matrix whose product with its transpose differs by "
-                f"{excess:.2g} "
-                "from the identity."
+                f"`rotation` must be orthonormal, got a matrix whose product with its transpose differs "
+                f"from the identity by {excess:.2g}."
             )
         object.__setattr__(self, "center", _as_field(center, "center", (3,)))
         object.__setattr__(self, "half_extents", _as_size(half_extents, "half_extents", (3,)))
