@@ -1,4 +1,4 @@
-"""What the tests of the command share: a way to run it, a tiny model, a few made-up clips."""
+"""What the tests of the command share: ways to run it, and a few made-up clips."""
 
 from __future__ import annotations
 
@@ -7,18 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from typer.testing import CliRunner
 
 from controlmm.cli.main import app
-from controlmm.models.control_branch import ControlBranch, ControlBranchConfig
-from controlmm.models.masked_transformer import MaskedTransformer, MaskedTransformerConfig
-from controlmm.models.residual_transformer import ResidualTransformer, ResidualTransformerConfig
-from controlmm.models.rvq_vae import RvqVae, RvqVaeConfig
-from controlmm.motion.normalizer import Normalizer
 from controlmm.motion.skeleton import HUMANML3D
-from controlmm.pipelines import ControlMM
-from controlmm.text import HashingTextEncoder
 
 USER_ERROR = 2
 FRAMES = 70  # of a made-up clip; training windows take 64
@@ -50,26 +42,6 @@ def refused() -> Callable[..., str]:
         return result.stderr
 
     return run
-
-
-@pytest.fixture(scope="session")
-def tiny_pipeline_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A pipeline of random weights with the hashing text encoder."""
-    torch.manual_seed(5)
-    tokenizer = RvqVae(RvqVaeConfig.tiny())
-    for name, buffer in tokenizer.named_buffers():
-        if name.endswith("codes"):  # zero until training fills them
-            buffer.normal_()
-    base = MaskedTransformer(MaskedTransformerConfig.tiny())
-    pipeline = ControlMM(
-        tokenizer=tokenizer,
-        transformer=base,
-        residual=ResidualTransformer(ResidualTransformerConfig.tiny()),
-        control=ControlBranch.beside(base, ControlBranchConfig.tiny()),
-        normalizer=Normalizer(torch.zeros(263), torch.full((263,), 0.1)),
-        text_encoder=HashingTextEncoder(),
-    )
-    return pipeline.save_pretrained(tmp_path_factory.mktemp("model") / "tiny")
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""``controlmm train``, ``plot``, ``assemble``: the whole way from joints to a model, and runs that are stopped."""
+"""``controlmm train``, ``plot``, ``assemble``: the whole way from joints to a model; stopped runs."""
 
 from __future__ import annotations
 
