@@ -7,11 +7,23 @@ struct GuidanceScratch {
     const std::int64_t padded = round_up_to_lanes(shape.frames);
     heading = {memory, memory + padded, memory + 2 * padded, memory + 3 * padded};
     root = {memory + 4 * padded, memory + 5 * padded, memory + 6 * padded};
-    staged = reinterpret_cast<T*>(memory + 7 * padded);
-    is_controlled = reinterpret_cast<std::uint8_t*>(memory + 7 * padded + obstacle_scratch(obstacles));
+    T* series[7];
+    for (int i = 0; i < 7; ++i) series[i] = reinterpret_cast<T*>(memory + (7 + i) * padded);
+    turn = {series[0], series[1], series[2], series[3]};
+    sums = {series[4], series[5], series[6]};
+    staged = reinterpret_cast<T*>(memory + 14 * padded);
+    is_controlled = reinterpret_cast<std::uint8_t*>(memory + 14 * padded + obstacle_scratch(obstacles));
   }
+  struct Turn {
+    T *cos, *sin, *x, *z;
+  };
+  struct Sums {
+    T *x, *z, *yaw;
+  };
   Heading heading;
   RootGradient root;
+  Turn turn;  // heading and root path in the precision of the joints
+  Sums sums;  // what the joints of each frame have sent to the root so far
   T* staged;
   std::uint8_t* is_controlled;  // one flag a joint
 };
@@ -79,18 +91,46 @@ struct FrameBlock {
 };
 
 template <class T>
-CONTROLMM_INLINE FrameBlock<T> load_block(const Heading& h, std::int64_t first, std::int64_t frames) {
+CONTROLMM_INLINE FrameBlock<T> load_block(const GuidanceScratch<T>& scratch, std::int64_t first, std::int64_t frames) {
   const std::int64_t count = frames - first < kLanes ? frames - first : kLanes;
-  const Lanes<T> zero = zeros<T>();
+  const auto &turn = scratch.turn, &sums = scratch.sums;
   return {first,
           count,
-          load_narrowed<T>(h.cos + first),
-          load_narrowed<T>(h.sin + first),
-          load_narrowed<T>(h.x + first),
-          load_narrowed<T>(h.z + first),
-          zero,
-          zero,
-          zero};
+          load(turn.cos + first),
+          load(turn.sin + first),
+          load(turn.x + first),
+          load(turn.z + first),
+          load(sums.x + first),
+          load(sums.z + first),
+          load(sums.yaw + first)};
+}
+
+template <class T>
+CONTROLMM_INLINE void store_sums(const FrameBlock<T>& block, const GuidanceScratch<T>& scratch) {
+  store(scratch.sums.x + block.first, block.grad_x);
+  store(scratch.sums.z + block.first, block.grad_z);
+  store(scratch.sums.yaw + block.first, block.grad_yaw);
+}
+
+template <class T>
+void start_clip(const GuidanceScratch<T>& scratch, std::int64_t frames) {
+  const Lanes<T> zero = zeros<T>();
+  for (std::int64_t t = 0; t < frames; t += kLanes) {
+    store(scratch.turn.cos + t, load_narrowed<T>(scratch.heading.cos + t));
+    store(scratch.turn.sin + t, load_narrowed<T>(scratch.heading.sin + t));
+    store(scratch.turn.x + t, load_narrowed<T>(scratch.heading.x + t));
+    store(scratch.turn.z + t, load_narrowed<T>(scratch.heading.z + t));
+    for (T* sum : {scratch.sums.x, scratch.sums.z, scratch.sums.yaw}) store(sum + t, zero);
+  }
+}
+
+template <class T>
+void finish_root_sums(const GuidanceScratch<T>& scratch, std::int64_t frames) {
+  for (std::int64_t t = 0; t < frames; t += kLanes) {
+    store(scratch.root.x + t, to_double(load(scratch.sums.x + t)));
+    store(scratch.root.z + t, to_double(load(scratch.sums.z + t)));
+    store(scratch.root.yaw + t, to_double(load(scratch.sums.yaw + t)));
+  }
 }
 
 // Three neighbouring channels of a decoder output, de-normalised.
@@ -190,9 +230,41 @@ void zero_joint(const GuidanceArgs<T>& args, std::int64_t clip, std::int64_t joi
   }
 }
 
+// Joint by joint over all frames: each channel is one long run of memory, which prefetching needs.
+template <class T>
+void guide_without_obstacles(const GuidanceArgs<T>& args, const GuidanceScratch<T>& scratch, ClipTerms<T>& terms) {
+  const std::int64_t frames = args.shape.frames;
+  for (std::int64_t j = 0; j < args.shape.joints; ++j) {
+    if (j > 0 && !scratch.is_controlled[j]) continue;
+    for (std::int64_t t = 0; t < frames; t += kLanes) {
+      FrameBlock<T> block = load_block(scratch, t, frames);
+      if (j == 0)
+        guide_root(args, scratch, block, terms);
+      else
+        guide_joint(args, scratch, block, j, terms);
+      store_sums(block, scratch);
+    }
+  }
+}
+
+// Frames in the outer loop: the obstacles of sixteen frames stay in the innermost cache for all joints.
+template <class T>
+void guide_among_obstacles(const GuidanceArgs<T>& args, const GuidanceScratch<T>& scratch, ClipTerms<T>& terms) {
+  const std::int64_t frames = args.shape.frames, length = args.obstacles.lengths[terms.clip];
+  for (std::int64_t t = 0; t < frames; t += kLanes) {
+    FrameBlock<T> block = load_block(scratch, t, frames);
+    terms.in_length = first_lanes<T>(length - t < block.count ? length - t : block.count);
+    if (t < length) stage_obstacles(args.obstacles, terms.clip, t, block.count, scratch.staged);
+    guide_root(args, scratch, block, terms);
+    for (std::int64_t j = 1; j < args.shape.joints; ++j)
+      if (scratch.is_controlled[j] || args.obstacles.is_active[j]) guide_joint(args, scratch, block, j, terms);
+    store_sums(block, scratch);
+  }
+}
+
 template <class T>
 void guide_clip(const GuidanceArgs<T>& args, std::int64_t clip, const GuidanceScratch<T>& scratch) {
-  const std::int64_t frames = args.shape.frames, joints = args.shape.joints;
+  const std::int64_t frames = args.shape.frames;
   const Strided3<const T>& d = args.decoded;
   const Strided3<T>& g = args.gradient;
   RootChannels root;
@@ -201,33 +273,25 @@ void guide_clip(const GuidanceArgs<T>& args, std::int64_t clip, const GuidanceSc
     root.shift[c] = static_cast<double>(args.mean[c]);
   }
   compute_heading(d.data + clip * d.clip, d.frame, d.channel, frames, root, scratch.heading);
+  start_clip(scratch, frames);
 
+  const bool has_obstacles = args.obstacles.count != 0;
   const std::int64_t controlled = find_controlled_joints(args, clip, scratch.is_controlled);
   const double control_scale = controlled == 0 ? 0 : 1 / static_cast<double>(controlled);
-  const double obstacle_scale = args.obstacles.count == 0 ? 0 : args.obstacle_scales[clip];
-  const std::int64_t length = args.obstacles.count == 0 ? 0 : args.obstacles.lengths[clip];
-  const auto is_needed = [&](std::int64_t j) {
-    return scratch.is_controlled[j] || (length > 0 && args.obstacles.is_active[j]);
-  };
+  const double obstacle_scale = has_obstacles ? args.obstacle_scales[clip] : 0;
   ClipTerms<T> terms{clip,
                      broadcast(static_cast<T>(control_scale)),
                      broadcast(static_cast<T>(obstacle_scale)),
                      Mask<T>{},
                      zeros<double>(),
                      zeros<double>()};
-  for (std::int64_t t = 0; t < frames; t += kLanes) {
-    FrameBlock<T> block = load_block<T>(scratch.heading, t, frames);
-    terms.in_length = first_lanes<T>(length - t < block.count ? length - t : block.count);
-    if (t < length) stage_obstacles(args.obstacles, clip, t, block.count, scratch.staged);
-    guide_root(args, scratch, block, terms);
-    for (std::int64_t j = 1; j < joints; ++j)
-      if (is_needed(j)) guide_joint(args, scratch, block, j, terms);
-    store(scratch.root.x + t, to_double(block.grad_x));
-    store(scratch.root.z + t, to_double(block.grad_z));
-    store(scratch.root.yaw + t, to_double(block.grad_yaw));
-  }
-  for (std::int64_t j = 1; j < joints; ++j)
-    if (!is_needed(j)) zero_joint(args, clip, j);
+  if (has_obstacles)
+    guide_among_obstacles(args, scratch, terms);
+  else
+    guide_without_obstacles(args, scratch, terms);
+  for (std::int64_t j = 1; j < args.shape.joints; ++j)
+    if (!scratch.is_controlled[j] && !(has_obstacles && args.obstacles.is_active[j])) zero_joint(args, clip, j);
+  finish_root_sums(scratch, frames);
   heading_backward(d.data + clip * d.clip, d.frame, d.channel, frames, root, scratch.heading, scratch.root,
                    g.data + clip * g.clip, g.frame, g.channel);
   args.loss[clip] = static_cast<T>(sum(terms.control_sum) * control_scale + sum(terms.obstacle_sum) * obstacle_scale);

@@ -156,7 +156,7 @@ static constexpr std::int64_t obstacle_scratch(std::int64_t count) { return coun
 
 /// Doubles of scratch memory for the fused kernel: time series, obstacles, and one flag a joint.
 static constexpr std::int64_t guidance_scratch(const MotionShape& shape, std::int64_t obstacles) {
-  return 7 * round_up_to_lanes(shape.frames) + obstacle_scratch(obstacles) + shape.joints;
+  return 14 * round_up_to_lanes(shape.frames) + obstacle_scratch(obstacles) + shape.joints;
 }
 
 const KernelTable& active_kernels();

@@ -80,10 +80,17 @@ def requested_backend(backend: Backend | None) -> Backend:
     return _checked(named) if named else "auto"
 
 
+# torch.compile bakes the choice in while tracing. This is what torch.compiler.assume_constant_result sets;
+# the decorator itself would import the compiler, which costs a second.
+requested_backend._dynamo_marked_constant = True  # type: ignore[attr-defined]
+
+
 def _obstacle_to_native(tensors: tuple[Tensor, ...]) -> str | None:
     """Why the kernels cannot take these tensors, or None if they can."""
     if _core is None:
         return f"the extension is not available ({_core_missing_because})"
+    if torch.compiler.is_compiling():
+        return _obstacle_to_tracing(tensors)
     if torch._C._are_functorch_transforms_active():
         return "torch.func transforms (vmap, grad, jvp) need plain torch operators"
     dtype = tensors[0].dtype
@@ -97,6 +104,38 @@ def _obstacle_to_native(tensors: tuple[Tensor, ...]) -> str | None:
         if type(tensor) is not Tensor and type(tensor) is not torch.nn.Parameter:
             return f"a tensor is a {type(tensor).__name__}, whose own behaviour the kernels would bypass"
     return None
+
+
+def _register_operators() -> bool:
+    importlib.import_module("controlmm.ops.library")
+    return True
+
+
+_register_operators._dynamo_marked_constant = True  # type: ignore[attr-defined]
+
+
+def _obstacle_to_tracing(tensors: tuple[Tensor, ...]) -> str | None:
+    dtype = tensors[0].dtype
+    fits = dtype in (torch.float32, torch.float64) and all(
+        tensor.device.type == "cpu" and tensor.dtype == dtype for tensor in tensors
+    )
+    if not fits:
+        return "tensors must be all float32 or all float64, on the CPU"
+    _register_operators()  # now, not at import: torch.library takes a second to load
+    return None
+
+
+def refuse_second_derivative(operator: str) -> None:
+    """Called in every native backward pass; autograd records there only if it is to be differentiated again.
+
+    Raises:
+        RuntimeError: If it is.
+    """
+    if torch.is_grad_enabled():
+        raise RuntimeError(
+            f"`{operator}` has no second derivative in its native form. Use `backend='reference'` for "
+            "`create_graph=True`."
+        )
 
 
 def runs_native(backend: Backend | None, *tensors: Tensor) -> bool:

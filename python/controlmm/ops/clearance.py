@@ -47,7 +47,7 @@ def resolve_clearance(
     is_active = _active_joints(joints, indices).to(like.device)
     if lengths is None:
         lengths = _all_frames(batch, frames).to(like.device)
-    elif lengths.shape != (batch,) or bool((lengths < 0).any()) or bool((lengths > frames).any()):
+    elif lengths.shape != (batch,) or not _all_between(lengths, 0, frames):
         raise ValueError(f"`lengths` must be {batch} values between 0 and {frames}, got {lengths.tolist()}.")
     radii = _radii(joint_radius, joints, like)
     return Clearance(radii, is_active, lengths.to(torch.int64).contiguous(), float(margin))
@@ -58,11 +58,17 @@ def _radii(joint_radius: float | Tensor, joints: int, like: Tensor) -> Float[Ten
         if not joint_radius >= 0:
             raise ValueError(f"`joint_radius` must be at least 0 m, got {joint_radius}.")
         return _equal_radii(joints, float(joint_radius), like.dtype).to(like.device)
-    if joint_radius.shape != (joints,) or not bool((joint_radius >= 0).all()):
+    if joint_radius.shape != (joints,) or not _all_between(joint_radius, 0, float("inf")):
         raise ValueError(
             f"`joint_radius` must be {joints} values of at least 0 m, got {joint_radius.tolist()}."
         )
     return joint_radius.to(like).contiguous()
+
+
+def _all_between(values: Tensor, low: float, high: float) -> bool:
+    if torch.compiler.is_compiling():
+        return True  # values are not known while tracing; the kernels check lengths again
+    return bool(((values >= low) & (values <= high)).all())
 
 
 # An editing loop asks for the same few of these at every step.

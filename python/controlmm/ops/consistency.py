@@ -7,9 +7,8 @@ from typing import Any, Literal, get_args
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
-from controlmm.ops.backend import Backend, core, runs_native
+from controlmm.ops.backend import Backend, core, refuse_second_derivative, runs_native
 from controlmm.ops.reference import masked_consistency_loss_reference
 
 Norm = Literal["l2", "l1", "mse"]
@@ -64,8 +63,10 @@ def check_consistency_arguments(joints: Tensor, targets: Tensor, mask: Tensor, n
     if norm not in NORM_CODES:
         raise ValueError(f"`norm` must be one of {tuple(NORM_CODES)}, got {norm!r}.")
     if not joints.is_floating_point() or targets.dtype != joints.dtype:
-        "`joints` and `targets` must share one floating-point dtype, "
-        f"got {joints.dtype} and {targets.dtype}."
+        raise TypeError(
+            "`joints` and `targets` must share one floating-point dtype, "
+            f"got {joints.dtype} and {targets.dtype}."
+        )
     if joints.ndim != 4 or joints.shape[-1] != 3 or targets.shape != joints.shape:
         raise ValueError(
             "`joints` and `targets` must both have shape (B, T, J, 3), "
@@ -83,6 +84,9 @@ def check_consistency_arguments(joints: Tensor, targets: Tensor, mask: Tensor, n
 def _consistency_native(
     joints: Tensor, targets: Tensor, mask: Tensor, norm: Norm, reduction: Reduction
 ) -> Tensor:
+    if torch.compiler.is_compiling():
+        loss: Tensor = torch.ops.controlmm.masked_consistency_loss(joints, targets, mask, norm, reduction)[0]
+        return loss
     needs_gradient = torch.is_grad_enabled() and (joints.requires_grad or targets.requires_grad)
     if needs_gradient:
         result: Tensor = _MaskedConsistency.apply(joints, targets, mask, norm, reduction)
@@ -125,8 +129,8 @@ class _MaskedConsistency(torch.autograd.Function):
         return loss
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor | None, Tensor | None, None, None, None]:
+        refuse_second_derivative("masked_consistency_loss")
         joints, targets, mask, counts = ctx.saved_tensors
         grad = consistency_backward(joints, targets, mask, ctx.norm, grad_loss, counts)
         wants_joints, wants_targets = ctx.needs_input_grad[:2]

@@ -88,13 +88,41 @@ def guidance_value_and_grad(
             decoded, targets, full_mask, mean, std, norm, packed, clearance, is_mean, obstacle_weight
         )
         return loss, gradient if out is None else out.copy_(gradient)
-    loss = decoded.new_empty(batch)
+    obstacle_arguments = native_arguments(packed, clearance)
+    scalars = (clearance.margin, is_mean, obstacle_weight)
+    if torch.compiler.is_compiling():
+        tensors = [tensor.detach() for tensor in (decoded, mean, std, targets)]
+        loss, gradient = torch.ops.controlmm.guidance_value_and_grad(
+            *tensors, full_mask, norm, *obstacle_arguments, *scalars
+        )
+        return loss, gradient if out is None else out.copy_(gradient)
     gradient = torch.zeros_like(decoded, requires_grad=False) if out is None else out
-    core().guidance_value_and_grad(
-        decoded, mean, std, targets, full_mask, NORM_CODES[norm], *native_arguments(packed, clearance),
-        clearance.margin, is_mean, obstacle_weight, loss, gradient, torch.get_num_threads(),
-    )  # fmt: skip
+    loss = guidance_native(
+        decoded, mean, std, targets, full_mask, norm, obstacle_arguments, *scalars, gradient
+    )
     return loss, gradient
+
+
+def guidance_native(
+    decoded: Tensor,
+    mean: Tensor,
+    std: Tensor,
+    targets: Tensor,
+    mask: Tensor,
+    norm: Norm,
+    obstacle_arguments: tuple[Tensor, ...],
+    margin: float,
+    is_mean: bool,
+    obstacle_weight: float,
+    gradient: Tensor,
+) -> Float[Tensor, "B"]:
+    """The kernel alone: writes ``gradient`` and returns the loss."""
+    loss = decoded.new_empty(decoded.shape[0])
+    core().guidance_value_and_grad(
+        decoded, mean, std, targets, mask, NORM_CODES[norm], *obstacle_arguments, margin, is_mean,
+        obstacle_weight, loss, gradient, torch.get_num_threads(),
+    )  # fmt: skip
+    return loss
 
 
 def frames_last(tensor: Tensor) -> Tensor:

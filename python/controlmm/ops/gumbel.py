@@ -7,9 +7,8 @@ from typing import Any
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
-from controlmm.ops.backend import Backend, core, runs_native
+from controlmm.ops.backend import Backend, core, refuse_second_derivative, runs_native
 from controlmm.ops.philox import gumbel_noise_reference
 
 _MOST_CLIPS = 2**31
@@ -79,6 +78,12 @@ def gumbel_straight_through(
     if not runs_native(backend, logits, codebook):
         return _gumbel_reference(logits, codebook, temperature, seed, first_clip, hard)
     arguments = (logits, codebook, temperature, seed, first_clip, hard)
+    if torch.compiler.is_compiling():
+        signed_seed = seed - 2**64 if seed >= 2**63 else seed  # operator schemas know signed integers only
+        traced = torch.ops.controlmm.gumbel_straight_through(
+            logits, codebook, temperature, signed_seed, first_clip, hard
+        )
+        return traced[0], traced[1]
     if torch.is_grad_enabled() and (logits.requires_grad or codebook.requires_grad):
         embeddings, ids = _GumbelStraightThrough.apply(*arguments)
         return embeddings, ids
@@ -181,10 +186,10 @@ class _GumbelStraightThrough(torch.autograd.Function):
         return embeddings, ids
 
     @staticmethod
-    @once_differentiable
     def backward(
         ctx: Any, grad_embeddings: Tensor, _: Tensor
     ) -> tuple[Tensor | None, Tensor | None, None, None, None, None]:
+        refuse_second_derivative("gumbel_straight_through")
         codebook, ids, probabilities = ctx.saved_tensors
         grad_logits = grad_codebook = None
         if ctx.needs_input_grad[0]:

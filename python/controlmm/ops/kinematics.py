@@ -7,9 +7,8 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
-from controlmm.ops.backend import Backend, core, runs_native
+from controlmm.ops.backend import Backend, core, refuse_second_derivative, runs_native
 from controlmm.ops.reference import recover_joints_reference
 
 
@@ -55,6 +54,9 @@ def _check_features(features: Tensor, joints: int) -> None:
 
 
 def _recover_joints_native(features: Float[Tensor, "B T D"], joints: int) -> Float[Tensor, "B T J 3"]:
+    if torch.compiler.is_compiling():
+        traced: Tensor = torch.ops.controlmm.recover_joints(features, joints)
+        return traced
     if features.requires_grad and torch.is_grad_enabled():
         result: Tensor = _RecoverJoints.apply(features, joints)
         return result
@@ -84,7 +86,7 @@ class _RecoverJoints(torch.autograd.Function):
         return recover_joints_forward(features, joints)
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, grad_joints: Tensor) -> tuple[Tensor, None]:
+        refuse_second_derivative("recover_joints")
         (features,) = ctx.saved_tensors
         return recover_joints_backward(features, grad_joints), None

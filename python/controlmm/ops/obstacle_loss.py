@@ -8,9 +8,8 @@ from typing import Any, Literal, get_args
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
-from controlmm.ops.backend import Backend, core, requested_backend, runs_native
+from controlmm.ops.backend import Backend, core, refuse_second_derivative, requested_backend, runs_native
 from controlmm.ops.clearance import Clearance, resolve_clearance
 from controlmm.ops.obstacles import Obstacle, PackedObstacles, pack_obstacles
 from controlmm.ops.signed_distance import obstacle_loss_reference
@@ -64,10 +63,16 @@ def obstacle_loss(
     if not obstacles_run_native(backend, packed, joints):
         counts = clearance.counts(frames)
         return obstacle_loss_reference(joints, packed, counts, clearance.radii, margin, reduction)
+    if torch.compiler.is_compiling():
+        traced: Tensor = torch.ops.controlmm.obstacle_loss(
+            joints, *native_arguments(packed, clearance), clearance.margin, reduction == "mean"
+        )
+        return traced
+    arguments = native_arguments(packed, clearance)
     if joints.requires_grad and torch.is_grad_enabled():
-        result: Tensor = _ObstacleLoss.apply(joints, packed, clearance, reduction == "mean")
+        result: Tensor = _ObstacleLoss.apply(joints, arguments, clearance.margin, reduction == "mean")
         return result
-    return obstacle_loss_forward(joints, packed, clearance, reduction == "mean")
+    return obstacle_loss_forward(joints, arguments, clearance.margin, reduction == "mean")
 
 
 def check_obstacle_reduction(reduction: str) -> None:
@@ -132,32 +137,37 @@ def native_arguments(packed: PackedObstacles, clearance: Clearance) -> tuple[Ten
 
 
 def obstacle_loss_forward(
-    joints: Tensor, packed: PackedObstacles, clearance: Clearance, is_mean: bool
+    joints: Tensor, arguments: tuple[Tensor, ...], margin: float, is_mean: bool
 ) -> Float[Tensor, "B"]:
-    """The kernel alone, without autograd."""
+    """The kernel alone, without autograd; ``arguments`` as given by ``native_arguments``."""
     loss = joints.new_empty(joints.shape[0])
-    arguments = native_arguments(packed, clearance)
-    core().obstacle_loss(joints, *arguments, clearance.margin, is_mean, loss, torch.get_num_threads())
+    core().obstacle_loss(joints, *arguments, margin, is_mean, loss, torch.get_num_threads())
     return loss
+
+
+def obstacle_loss_backward(
+    joints: Tensor, arguments: tuple[Tensor, ...], margin: float, is_mean: bool, grad_loss: Tensor
+) -> Float[Tensor, "B T J 3"]:
+    """The gradient kernel alone, with respect to ``joints``."""
+    grad = torch.empty_like(joints)
+    core().obstacle_loss_backward(
+        joints, *arguments, margin, is_mean, grad_loss, grad, torch.get_num_threads()
+    )
+    return grad
 
 
 class _ObstacleLoss(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, joints: Tensor, packed: PackedObstacles, clearance: Clearance, is_mean: bool
+        ctx: Any, joints: Tensor, arguments: tuple[Tensor, ...], margin: float, is_mean: bool
     ) -> Tensor:
         ctx.save_for_backward(joints)
-        ctx.arguments = packed, clearance, is_mean
-        return obstacle_loss_forward(joints, packed, clearance, is_mean)
+        ctx.arguments = arguments, margin, is_mean
+        return obstacle_loss_forward(joints, arguments, margin, is_mean)
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, grad_loss: Tensor) -> tuple[Tensor, None, None, None]:
+        refuse_second_derivative("obstacle_loss")
         (joints,) = ctx.saved_tensors
-        packed, clearance, is_mean = ctx.arguments
-        grad = torch.empty_like(joints)
-        core().obstacle_loss_backward(
-            joints, *native_arguments(packed, clearance), clearance.margin, is_mean, grad_loss, grad,
-            torch.get_num_threads(),
-        )  # fmt: skip
-        return grad, None, None, None
+        arguments, margin, is_mean = ctx.arguments
+        return obstacle_loss_backward(joints, arguments, margin, is_mean, grad_loss), None, None, None
