@@ -1,4 +1,4 @@
-"""Fixtures that several test folders share: a synthetic walk, a data folder of it, and an untrained tiny pipeline."""
+"""Fixtures of all test folders: a synthetic walk, a data folder of walks, an untrained tiny pipeline."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from controlmm.pipelines import ControlMM
 from controlmm.text.hashing import HashingTextEncoder
 
 STRIDE = 22  # frames of two steps
+DECIDED = 30.0  # times fresh weights: logits as peaked and texts as audible as after training
 SMALLEST_STD = 0.01  # of a synthetic channel: a walk hardly moves some of them
 
 
@@ -34,9 +35,10 @@ def shared() -> Path:
 
 
 def make_walk(frames: int, *, turn: float = 0.3, heading: float = 0.0, speed: float = 0.05) -> torch.Tensor:
-    """(T, 22, 3) float64 joints in metres of a walk that turns left by ``turn`` radians, forward kinematics by hand.
+    """(T, 22, 3) float64 joints in metres of a walk that turns left by ``turn`` radians.
 
-    The legs and arms swing about the sideways axis, the upper body leans a little; bone lengths are HumanML3D's.
+    Forward kinematics by hand: the legs and arms swing about the sideways axis, the upper body leans a
+    little. Bone lengths are HumanML3D's.
     """
     phase = 2 * math.pi * torch.arange(frames, dtype=torch.float64) / STRIDE
     yaw = heading + turn * torch.arange(frames, dtype=torch.float64) / max(1, frames - 1)
@@ -63,7 +65,7 @@ def _pitched(offset: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
 
 
 def turned(points: torch.Tensor, yaw: torch.Tensor | float) -> torch.Tensor:
-    """``points`` (..., 3) turned left about Y by ``yaw`` radians, which broadcasts against the leading axes."""
+    """``points`` (..., 3) turned left about Y by ``yaw`` radians, which broadcasts with the leading axes."""
     yaw = torch.as_tensor(yaw, dtype=points.dtype)
     x, y, z = points.unbind(-1)
     return torch.stack([x * yaw.cos() + z * yaw.sin(), y, z * yaw.cos() - x * yaw.sin()], dim=-1)
@@ -107,9 +109,14 @@ def make_tiny_pipeline() -> ControlMM:
         tokenizer = RvqVae(RvqVaeConfig.tiny())
         for layer in range(tokenizer.config.num_quantizers):
             tokenizer.quantizer.book(layer).codes.normal_()
+        _amplify(tokenizer.decoder)
         transformer = MaskedTransformer(MaskedTransformerConfig.tiny())
+        transformer.head[-1].weight.data.mul_(DECIDED)
+        transformer.text_proj.weight.data.mul_(DECIDED)
         control = ControlBranch.beside(transformer, ControlBranchConfig.tiny())
         residual = ResidualTransformer(ResidualTransformerConfig.tiny())
+        for zero in (control.first_zero, *control.mid_zeros):
+            torch.nn.init.normal_(zero.weight, std=0.1)
     return ControlMM(
         tokenizer=tokenizer,
         transformer=transformer,
@@ -120,6 +127,13 @@ def make_tiny_pipeline() -> ControlMM:
     )
 
 
+def _amplify(decoder: torch.nn.Module) -> None:
+    """Weights that pass the latents on at full strength; fresh ones let motions hardly differ."""
+    for module in decoder.modules():
+        if isinstance(module, torch.nn.Conv1d):
+            torch.nn.init.kaiming_normal_(module.weight)
+
+
 @pytest.fixture
 def tiny_pipeline_folder(tmp_path: Path) -> Path:
     """The tiny pipeline as written by ``save_pretrained``."""
@@ -128,7 +142,7 @@ def tiny_pipeline_folder(tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def tiny_data_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A HumanML3D-style folder of synthetic walks with captions: train (6 with mirrored ones), val 4, test 2."""
+    """A HumanML3D-style folder of walks with captions, mirrored ones counted: train 6, val 4, test 2."""
     folder = tmp_path_factory.mktemp("tiny_data")
     turns = {"train": (0.0, 0.8, -1.2), "val": (0.5, -0.5), "test": (1.0,)}
     clips = [

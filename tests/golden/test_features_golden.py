@@ -85,7 +85,7 @@ def test_features_decode_to_the_public_joints(synthetic, case):
     features = joints_to_features(synthetic[f"{case}_canonical_joints"])
     expected = synthetic[f"{case}_recovered_joints"]
     actual = recover_joints(features[None], joints=expected.shape[1])[0]
-    # One wrong bit of a yaw velocity turns all later frames, so decoded joints are further apart than features.
+    # One wrong bit of a yaw velocity turns all later frames: decoded joints are further apart than features.
     torch.testing.assert_close(actual, expected, rtol=0, atol=1e-2 if case.startswith("kit") else 1e-5)
 
 

@@ -50,7 +50,7 @@ def test_a_clip_is_cut_out_of_its_pack(walk, tmp_path):
 def test_sources_are_chosen_and_unknown_ones_refused(walk, tmp_path):
     write_pack(tmp_path, walk, RECORD, {**RECORD, "id": "a", "source": "field"})
     assert [clip.id for clip in read_packs(tmp_path, sources=["field"])] == ["a"]
-    with pytest.raises(ValueError, match="has no source moon. It has: field, lab"):
+    with pytest.raises(ValueError, match=r"has no source moon\. It has: field, lab"):
         list(read_packs(tmp_path, sources=["moon", "lab"]))
 
 

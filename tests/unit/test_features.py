@@ -90,7 +90,7 @@ def test_repaired_features_have_no_first_frame_jump(walk):
 
 
 def test_left_turns_have_negative_half_angles(walk):
-    """For a heading angle phi with facing (sin phi, 0, cos phi) the channel holds -(phi_{t+1} - phi_t) / 2."""
+    """With phi the angle from +Z towards +X, the channel holds -(phi_{t+1} - phi_t) / 2."""
     per_frame = 0.01
     joints = canonicalize(walk(300, turn=per_frame * 299))
     middle = joints_to_features(joints, public_quirks=False)[120:180, 0]  # a steady turn survives smoothing

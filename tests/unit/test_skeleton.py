@@ -42,7 +42,7 @@ def test_layout_is_the_published_one(skeleton):
 def test_skeletons_are_found_by_width_and_joint_count():
     assert skeleton_of_width(263) is skeleton_of_joints(22) is HUMANML3D
     assert skeleton_of_width(251) is skeleton_of_joints(21) is KIT
-    with pytest.raises(ValueError, match="263 wide .* 251 wide .* got 259"):
+    with pytest.raises(ValueError, match=r"263 wide .* 251 wide .* got 259"):
         skeleton_of_width(259)
     with pytest.raises(ValueError, match=r"22 .* 21 .* got 24"):
         skeleton_of_joints(24)

@@ -1,0 +1,149 @@
+"""The four training stages on a tiny folder, from statistics to a pipeline that generates."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from controlmm.data import MotionFolder
+from controlmm.models.control_branch import ControlBranch
+from controlmm.models.masked_transformer import MaskedTransformer
+from controlmm.models.residual_transformer import ResidualTransformer
+from controlmm.motion.normalizer import Normalizer
+from controlmm.pipelines import ControlMM
+from controlmm.text.hashing import HashingTextEncoder
+from controlmm.training import loop
+from controlmm.training.run_folder import RunFolder
+from controlmm.training.stages import STAGES, load_tokenizer, train_stage
+
+QUICK = {"steps": 10, "validate_every": 5}
+
+
+def train(stage, data, root, **changes):
+    return train_stage(
+        stage,
+        data=data,
+        size="tiny",
+        root=root,
+        text_encoder=HashingTextEncoder(64),
+        changes=QUICK | changes,
+        progress=False,
+    )
+
+
+@pytest.fixture(scope="module")
+def trained(tiny_data_folder, tmp_path_factory):
+    """A root folder with all four stages trained for ten steps."""
+    root = tmp_path_factory.mktemp("trained")
+    for stage in STAGES:
+        train(stage, tiny_data_folder, root)
+    return root
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_every_stage_leaves_weights_a_log_and_what_it_was_told(trained, stage):
+    run = RunFolder(trained / stage)
+    records = run.records()
+    assert [record["step"] for record in records] == [5, 10, 10]
+    assert all(torch.isfinite(torch.tensor(list(record.values()))).all() for record in records)
+    assert (run.path / "best" / "model.safetensors").is_file()
+    assert '"sha256"' in (run.path / "run.json").read_text()
+
+
+def test_statistics_are_those_of_the_training_split(trained, tiny_data_folder):
+    expected = Normalizer.fit(clip.features for clip in MotionFolder(tiny_data_folder).clips("train"))
+    assert torch.equal(Normalizer.load(trained / "normalizer.safetensors").std, expected.std)
+
+
+def test_the_trained_parts_make_a_pipeline_that_generates(trained):
+    tokenizer, normalizer = load_tokenizer(trained)
+    pipeline = ControlMM(
+        tokenizer=tokenizer,
+        normalizer=normalizer,
+        transformer=MaskedTransformer.from_pretrained(trained / "masked" / "best"),
+        residual=ResidualTransformer.from_pretrained(trained / "residual" / "best"),
+        control=ControlBranch.from_pretrained(trained / "control" / "best"),
+        text_encoder=HashingTextEncoder(64),
+    )
+    assert pipeline("a person walks", frames=16, preset="fast").best.num_frames == 16
+
+
+def test_base_and_tokenizer_stay_frozen_while_control_is_trained(trained):
+    """The control run's checkpoint holds the branch alone, and the branch has left the base's weights."""
+    names = load_file(trained / "control" / "checkpoint.safetensors")
+    base = MaskedTransformer.from_pretrained(trained / "masked" / "best")
+    assert not any("token_embedding" in name or "quantizer" in name for name in names)
+    branch = names["model.layers.0.linear1.weight"]
+    assert not torch.equal(branch, base.layers[0].linear1.weight)
+    assert names["model.first_zero.weight"].abs().max() > 0
+
+
+class KilledError(Exception):
+    """The kill."""
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_killed_and_resumed_stage_equals_the_unbroken_one_bit_by_bit(
+    trained, tiny_data_folder, tmp_path, monkeypatch, stage
+):
+    for name in ("normalizer.safetensors", "rvq/best", "masked/best"):
+        if stage != "rvq":
+            (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / name).symlink_to(trained / name)
+    run = tmp_path / stage
+    if (run / "best").is_symlink():
+        (run / "best").unlink()
+    take_step = loop._take_step
+
+    def killed_at_eight(recipe, settings, optimizer, parameters, step):
+        if step == 7:
+            raise KilledError
+        return take_step(recipe, settings, optimizer, parameters, step)
+
+    monkeypatch.setattr(loop, "_take_step", killed_at_eight)
+    with pytest.raises(KilledError):
+        train(stage, tiny_data_folder, tmp_path)
+    monkeypatch.setattr(loop, "_take_step", take_step)
+    train(stage, tiny_data_folder, tmp_path)
+
+    for name in ("checkpoint.safetensors", "best/model.safetensors"):
+        expected, actual = load_file(trained / stage / name), load_file(run / name)
+        assert expected.keys() == actual.keys()
+        assert all(torch.equal(expected[key], actual[key]) for key in expected), name
+    assert RunFolder(run).records() == RunFolder(trained / stage).records()
+
+
+def test_a_stage_needs_the_ones_before_it(tiny_data_folder, tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"rvq holds no trained stage\. Run `controlmm train rvq`"):
+        train("masked", tiny_data_folder, tmp_path)
+
+
+def test_other_data_is_not_mixed_into_a_run(trained, tiny_data_folder, walk, tmp_path):
+    from controlmm.data import Caption, Clip, write_folder
+
+    clips = [Clip(s, walk(70), (Caption("walks"),), split=s) for s in ("train", "val")]
+    write_folder(clips, tmp_path, progress=False)
+    with pytest.raises(ValueError, match="masked holds a run with another data"):
+        train("masked", tmp_path, trained)
+
+
+def test_unknown_names_and_a_missing_text_encoder_are_refused(tiny_data_folder, tmp_path):
+    with pytest.raises(ValueError, match=r"Unknown stage or size 'vq'.*Stages: rvq, masked"):
+        train("vq", tiny_data_folder, tmp_path)
+    with pytest.raises(FileNotFoundError, match="no HumanML3D-style folder"):
+        train("rvq", tmp_path / "nowhere", tmp_path)
+    with pytest.raises(ValueError, match="`text_encoder` is needed to train 'masked'"):
+        train_stage("masked", data=tiny_data_folder, size="tiny", root=tmp_path, progress=False)
+
+
+@pytest.mark.parametrize("split", ["train", "val"])
+def test_an_empty_split_is_named(tiny_data_folder, walk, tmp_path, split):
+    from controlmm.data import Clip, write_folder
+
+    clips = [Clip("a", walk(70), (), split="val" if split == "train" else "train")]
+    write_folder(clips, tmp_path / "data", progress=False)
+    with pytest.raises(
+        ValueError, match=f"The {'training' if split == 'train' else 'validation'} split has no"
+    ):
+        train("rvq", tmp_path / "data", tmp_path)
