@@ -191,7 +191,8 @@ def _forward(joints: Float[Tensor, "F J 3"], skeleton: Skeleton) -> Float[Tensor
     across = joints[:, left_hip] - joints[:, right_hip] + joints[:, right_shoulder] - joints[:, left_shoulder]
     across = across / across.norm(dim=-1, keepdim=True)
     _check_defined(across)  # here, since smoothing would blame the frames around
-    return torch.linalg.cross(joints.new_tensor([0, 1, 0]).expand_as(across), across, dim=-1)
+    forward: Tensor = torch.linalg.cross(joints.new_tensor([0, 1, 0]).expand_as(across), across, dim=-1)
+    return forward
 
 
 def _smooth(forward: Float[Tensor, "F 3"]) -> Float[Tensor, "F 3"]:
