@@ -266,6 +266,7 @@ class ControlMM:
             latents,
             objective,
             iterations=preset.budget.latent_iterations,
+            rate=preset.budget.latent_rate * tokenizer.base_codes.std().item(),
             decays_rate=preset.budget.decays_rate,
             keep=keep,
             progress=request.progress,
