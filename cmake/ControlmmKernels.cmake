@@ -30,8 +30,12 @@ function(controlmm_add_isa name)
 endfunction()
 file(GLOB inl_files CONFIGURE_DEPENDS ${csrc}/kernels/*.inl)
 
-# Optimised for speed whatever the build type: -O3 also in RelWithDebInfo; Debug keeps its own level.
-set(isa_flags $<$<NOT:$<CONFIG:Debug>>:-O3>)
+# Optimised for speed whatever the build type; with sanitizers compile time counts more.
+if(CONTROLMM_SANITIZE)
+  set(isa_flags -O1 -g0)
+else()
+  set(isa_flags $<$<NOT:$<CONFIG:Debug>>:-O3>)
+endif()
 if(CMAKE_SYSTEM_PROCESSOR MATCHES "x86_64|AMD64")
   controlmm_add_isa(baseline ${isa_flags})
   controlmm_add_isa(avx2 ${isa_flags} -mavx2 -mfma)

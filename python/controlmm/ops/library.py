@@ -161,8 +161,11 @@ def _gumbel_gradient(ctx: Any, grad: Tensor, *_: Tensor) -> tuple[Tensor | None,
 
 def _guidance_cpu(decoded: Tensor, *rest: Any) -> tuple[Tensor, Tensor]:
     mean, std, targets, mask, norm = rest[:5]
+    margin, is_mean, obstacle_weight = rest[11:]
     gradient = torch.zeros_like(decoded)
-    loss = guidance_native(decoded, mean, std, targets, mask, norm, rest[5:11], *rest[11:], gradient)
+    loss = guidance_native(
+        decoded, mean, std, targets, mask, norm, rest[5:11], margin, is_mean, obstacle_weight, gradient
+    )
     return loss, gradient
 
 
