@@ -68,7 +68,7 @@ def test_every_stage_leaves_weights_settings_and_its_command(root: Path) -> None
         assert (root / stage / "best" / "model.safetensors").is_file()
         settings = json.loads((root / stage / "run.json").read_text())["settings"]
         assert (settings["steps"], settings["batch_size"]) == (4, 2)
-        assert (root / stage / "command.txt").read_text().startswith("controlmm ")
+        assert (root / stage / "command.txt").read_text().startswith("controlmm")
     assert json.loads((root / "text_encoder.json").read_text())["kind"] == "hashing"
 
 

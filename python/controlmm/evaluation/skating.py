@@ -59,7 +59,8 @@ def _slides(
     speed = (ground[:, 1:] - ground[:, :-1]).norm(dim=-1) * fps * is_pair[..., None]  # (B, T-1, 2)
     average = avg_pool1d(speed.mT, WINDOW, stride=1, padding=WINDOW // 2).mT
     is_low = feet[..., 1] < MAX_HEIGHT
-    return is_low[:, 1:] & is_low[:, :-1] & (speed > MIN_SPEED) & (average > MIN_SPEED)
+    slides: Tensor = is_low[:, 1:] & is_low[:, :-1] & (speed > MIN_SPEED) & (average > MIN_SPEED)
+    return slides
 
 
 def _checked_lengths(joints: Tensor, lengths: Tensor | None, skeleton: Skeleton) -> Tensor:
