@@ -134,6 +134,18 @@ def test_every_zero_linear_speaks_to_the_frozen_trunk(masked, zero):
     assert (branch(masked, sequence, signal, valid) - before)[valid].abs().max() > 1e-4
 
 
+def test_the_control_trunk_sees_the_hint(masked):
+    """With the frozen trunk left out of it, the first zero linear still changes the residuals."""
+    config = ControlBranchConfig.tiny()
+    config = type(config)(**{**vars(config), "into_frozen_trunk": False})
+    branch = ControlBranch.beside(masked, config).eval()
+    torch.nn.init.normal_(branch.mid_zeros[0].weight)
+    sequence, signal, valid = control_inputs(masked, branch)
+    before = branch(masked, sequence, signal, valid)
+    torch.nn.init.normal_(branch.first_zero.weight)
+    assert (branch(masked, sequence, signal, valid) - before)[valid].abs().max() > 1e-4
+
+
 def test_control_in_padding_does_not_reach_the_clip(masked):
     branch = ControlBranch.beside(masked, ControlBranchConfig.tiny()).eval()
     for zero in (branch.first_zero, *branch.mid_zeros):

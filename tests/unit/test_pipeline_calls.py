@@ -224,3 +224,40 @@ def test_no_gradient_is_kept(tiny_pipeline):
     assert not result.best.joints.requires_grad
     assert all(parameter.grad is None for parameter in tiny_pipeline.transformer.parameters())
     assert math.isfinite(result.control_error.item())
+
+
+@pytest.fixture
+def decoded(tiny_pipeline, monkeypatch):
+    """One controlled call without editing: its result, final logits, and motions that signals compared with."""
+    from controlmm.pipelines import controlmm as module
+
+    seen = {"current": []}
+    decode, signal = module.decode_with_control, tiny_pipeline.control.signal
+
+    def kept_logits(*args, **options):
+        seen["logits"] = decode(*args, **options)
+        return seen["logits"]
+
+    def kept_signal(targets, mask, current):
+        seen["current"].append(current)
+        return signal(targets, mask, current)
+
+    monkeypatch.setattr(module, "decode_with_control", kept_logits)
+    monkeypatch.setattr(tiny_pipeline.control, "signal", kept_signal)
+    plan = Preset(EditingBudget(latent_iterations=0), steps=3)
+    seen["result"] = tiny_pipeline(PROMPT, frames=16, controls=[WRIST], preset=plan)
+    return seen
+
+
+def test_the_first_control_signal_compares_with_the_motion_of_mean_codes(tiny_pipeline, decoded):
+    mean = tiny_pipeline.decoder.tokenizer.base_codes.mean(0).expand(1, 4, 16)
+    torch.testing.assert_close(decoded["current"][0], tiny_pipeline.decoder(mean))
+    assert not torch.allclose(decoded["current"][1], decoded["current"][0])
+
+
+def test_editing_starts_from_a_soft_base_layer_and_hard_residual_layers(tiny_pipeline, decoded):
+    tokenizer, logits = tiny_pipeline.decoder.tokenizer, decoded["logits"]
+    left = decoded["result"].latents - logits.softmax(-1) @ tokenizer.base_codes
+    first, second = (tokenizer.quantizer.book(layer).codes for layer in (1, 2))
+    sums = (first[:, None] + second).flatten(0, 1)
+    assert torch.cdist(left[0], sums).amin(1).max() < 1e-2  # cdist takes roots of rounded squares

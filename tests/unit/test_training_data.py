@@ -116,7 +116,7 @@ def test_published_masks_control_whole_points_inside_the_clip():
 
 def clip_of(name: str, frames: int, *captions: Caption, source: str = "lab") -> FeatureClip:
     """Channel 0 counts the frames, so that crops can be located."""
-    features = torch.zeros(frames, 263)
+    features = torch.randn(frames, 263, generator=torch.Generator().manual_seed(frames))
     features[:, 0] = torch.arange(frames)
     return FeatureClip(name, features, captions or (Caption("walks"),), source)
 
