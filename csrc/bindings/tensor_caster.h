@@ -3,9 +3,12 @@
 // Teaches the chosen binding package about TensorArgument; both ways end in the same TensorArgument::read.
 #if defined(CONTROLMM_NANOBIND)
 
+#pragma GCC diagnostic push
+#pragma GCC diagnostic ignored "-Wconversion"  // in its headers, beyond our reach
 #include <nanobind/nanobind.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
+#pragma GCC diagnostic pop
 
 #include "tensor_argument.h"
 namespace bindings = nanobind;
