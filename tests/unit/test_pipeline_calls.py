@@ -228,7 +228,7 @@ def test_no_gradient_is_kept(tiny_pipeline):
 
 @pytest.fixture
 def decoded(tiny_pipeline, monkeypatch):
-    """One controlled call without editing: result, final logits, and the motions that signals were made of."""
+    """One controlled call without editing: result, final logits, and the motions that signals came from."""
     from controlmm.pipelines import controlmm as module
 
     seen = {"current": []}
