@@ -92,14 +92,16 @@ def test_turning_and_shifting_the_whole_scene_changes_no_loss(seed, angle, shift
     joints = ops.recover_joints(motion(seed, 1, 9))
     moved = turned(joints, angle) + torch.tensor(shift, dtype=torch.float64)
     torch.testing.assert_close(
-        ops.obstacle_loss(moved, scene(angle, shift), margin=0.3), ops.obstacle_loss(joints, scene(), margin=0.3),
+        ops.obstacle_loss(moved, scene(angle, shift), margin=0.3),
+        ops.obstacle_loss(joints, scene(), margin=0.3),
         **ROUNDING,
     )  # fmt: skip
     mask = joints[..., 0] > 0
     targets = torch.zeros_like(joints)
     moved_targets = turned(targets, angle) + torch.tensor(shift, dtype=torch.float64)
     torch.testing.assert_close(
-        ops.masked_consistency_loss(moved, moved_targets, mask), ops.masked_consistency_loss(joints, targets, mask),
+        ops.masked_consistency_loss(moved, moved_targets, mask),
+        ops.masked_consistency_loss(joints, targets, mask),
         **ROUNDING,
     )  # fmt: skip
 
@@ -110,7 +112,8 @@ def test_mirroring_the_scene_changes_no_loss(seed):
     joints = ops.recover_joints(motion(seed, 1, 9))
     mirrored = joints * torch.tensor([-1.0, 1, 1], dtype=torch.float64)
     torch.testing.assert_close(
-        ops.obstacle_loss(mirrored, scene(mirror=-1.0), margin=0.3), ops.obstacle_loss(joints, scene(), margin=0.3),
+        ops.obstacle_loss(mirrored, scene(mirror=-1.0), margin=0.3),
+        ops.obstacle_loss(joints, scene(), margin=0.3),
         **ROUNDING,
     )  # fmt: skip
 
