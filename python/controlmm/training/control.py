@@ -21,7 +21,7 @@ from controlmm.training.tokens import TokenBatch, TokenSampler
 
 SETTINGS = {
     "paper": masked.SETTINGS["paper"],
-    "small": dataclasses.replace(masked.SETTINGS["small"], steps=2500, batch_size=48, learning_rate=4e-4),
+    "small": dataclasses.replace(masked.SETTINGS["small"], steps=1200, batch_size=48, learning_rate=4e-4),
     "tiny": masked.SETTINGS["tiny"],
 }
 _VALIDATION_BATCH = 50

@@ -17,7 +17,7 @@ SETTINGS = {
     "paper": TrainingSettings(
         steps=180_000, batch_size=64, milestones=(50_000,), weight_decay=1e-5, clip_norm=0.0, bf16=False
     ),
-    "small": TrainingSettings(steps=5000, batch_size=64, learning_rate=5e-4, warmup=300, weight_decay=0.01),
+    "small": TrainingSettings(steps=3000, batch_size=64, learning_rate=5e-4, warmup=300, weight_decay=0.01),
     "tiny": TrainingSettings(
         steps=20,
         batch_size=8,

@@ -18,7 +18,7 @@ from controlmm.training.tokens import TokenBatch, TokenSampler
 
 SETTINGS = {
     **masked.SETTINGS,
-    "small": dataclasses.replace(masked.SETTINGS["small"], steps=3000),
+    "small": dataclasses.replace(masked.SETTINGS["small"], steps=1400),
 }
 _VALIDATION_BATCH = 64
 
