@@ -39,9 +39,15 @@ def info(
 
 
 def _describe_model(path: Path | None) -> dict[str, str]:
-    from controlmm.pipelines.folder import TEXT_ENCODER_FILE, read_json, resolve_folder, shipped_folder
+    from controlmm.pipelines.folder import (
+        PIPELINE_FILE,
+        TEXT_ENCODER_FILE,
+        read_json,
+        resolve_folder,
+        shipped_folder,
+    )
 
-    if path is None and not shipped_folder().is_dir():
+    if path is None and not (shipped_folder() / PIPELINE_FILE).is_file():
         return {"weights": f"none come with this installation (looked in {shipped_folder()})"}
     folder = resolve_folder(path)
     files = sorted(folder.rglob("*.safetensors"))
