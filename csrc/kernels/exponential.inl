@@ -73,6 +73,7 @@ template <class T>
 CONTROLMM_INLINE Lanes<T> exp_of_nonpositive(const Lanes<T>& x) {
   using F = FloatFormat<T>;
   using Int = typename IntOf<T>::type;
+  using Word = std::make_unsigned_t<Int>;  // a NaN's exponent is no number, and may wrap around
   const Lanes<T> lowest = broadcast(F::kSmallestExponent), clamped = select(x < lowest, lowest, x);
   const Lanes<T> shifted = clamped * broadcast(T(1.4426950408889634)) + broadcast(F::kRound);
   const Lanes<T> n = shifted - broadcast(F::kRound);
@@ -80,6 +81,7 @@ CONTROLMM_INLINE Lanes<T> exp_of_nonpositive(const Lanes<T>& x) {
   Lanes<T> series = broadcast(static_cast<T>(kInverseFactorial[F::kExpTerms]));
   for (int i = F::kExpTerms - 1; i >= 0; --i) series = series * r + broadcast(static_cast<T>(kInverseFactorial[i]));
   const Lanes<Int> exponent = bits_of<Int>(shifted) - bits_of<Int>(broadcast(F::kRound));
-  const Lanes<T> power = bits_of<T>((exponent + broadcast(Int{F::kBias})) * broadcast(Int{1} << F::kMantissaBits));
+  const Lanes<Word> biased = bits_of<Word>(exponent) + broadcast(Word{F::kBias});
+  const Lanes<T> power = bits_of<T>(biased * broadcast(Word{1} << F::kMantissaBits));
   return select(x < lowest, zeros<T>(), series * power);
 }

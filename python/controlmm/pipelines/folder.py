@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ SHIPPED = "small"  # the model in the wheel
 
 def shipped_folder(name: str = SHIPPED) -> Path:
     """Folder of the trained model that comes with the package."""
-    return Path(str(resources.files("controlmm"))) / "pretrained" / name
+    return Path(__file__).resolve().parents[1] / "pretrained" / name
 
 
 def resolve_folder(path: str | Path | None) -> Path:
