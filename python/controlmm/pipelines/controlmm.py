@@ -29,6 +29,7 @@ from controlmm.models.control_branch import ControlBranch
 from controlmm.models.masked_transformer import MaskedTransformer
 from controlmm.models.residual_transformer import ResidualTransformer
 from controlmm.models.rvq_vae import RvqVae, frame_mask
+from controlmm.motion.ground import grounded
 from controlmm.motion.motion import Motion
 from controlmm.motion.normalizer import Normalizer
 from controlmm.motion.skeleton import Skeleton
@@ -146,6 +147,8 @@ class ControlMM:
     ) -> GenerationResult:
         """Generate ``samples`` motions.
 
+        Without height targets each motion is stood on the floor: its lowest joint touches y = 0.
+
         Args:
             prompt: What the person does, in words.
             seconds: Length, 0.4 to 9.8 s; or pass ``frames`` (8 to 196, at 20 fps). 6 s without either.
@@ -184,6 +187,8 @@ class ControlMM:
             progress=progress,
         )
         features = self.decoder.features(latents)[:, :count]
+        if not dense.mask[..., 1].any():
+            features = grounded(features)
         motions = tuple(self._motion(clip, prompt, dense, origin) for clip in features)
         joints = torch.stack([motion.joints for motion in motions])
         error = control_error(joints, dense.targets.expand_as(joints), dense.mask.expand_as(joints))

@@ -19,7 +19,7 @@ class GenerationResult:
         motions: One :class:`Motion` a sample, in the order of the seeds.
         control_error: (S,) mean distance of the controlled joints to their targets, metres, measured on the
             motions as returned; 0 without controls.
-        latents: (S, L, C) code-space latents that decode to the motions.
+        latents: (S, L, C) code-space latents that decode to the motions, before they were stood on the floor.
         seconds_taken: Wall-clock seconds of the call.
     """
 
