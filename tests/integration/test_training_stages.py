@@ -14,8 +14,11 @@ from controlmm.motion.normalizer import Normalizer
 from controlmm.pipelines import ControlMM
 from controlmm.text.hashing import HashingTextEncoder
 from controlmm.training import loop
+from controlmm.training.registry import CONTROLMM_STAGES as STAGES
+from controlmm.training.registry import MODULES, load_stage
 from controlmm.training.run_folder import RunFolder
-from controlmm.training.stages import STAGES, load_tokenizer, train_stage
+from controlmm.training.stage import load_tokenizer
+from controlmm.training.stages import train_stage
 
 QUICK = {"steps": 10, "validate_every": 5}
 
@@ -49,6 +52,14 @@ def test_every_stage_leaves_weights_a_log_and_what_it_was_told(trained, stage):
     assert all(torch.isfinite(torch.tensor(list(record.values()))).all() for record in records)
     assert (run.path / "best" / "model.safetensors").is_file()
     assert '"sha256"' in (run.path / "run.json").read_text()
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_every_name_leads_to_a_stage_that_has_a_tiny_size_and_known_needs(name):
+    stage = load_stage(name)
+    assert stage.name == name
+    assert stage.configs.keys() == stage.settings.keys() >= {"tiny"}
+    assert set(stage.needs) <= set(list(MODULES)[: list(MODULES).index(name)])
 
 
 def test_statistics_are_those_of_the_training_split(trained, tiny_data_folder):
@@ -128,13 +139,15 @@ def test_other_data_is_not_mixed_into_a_run(trained, tiny_data_folder, walk, tmp
         train("masked", tmp_path, trained)
 
 
-def test_unknown_names_and_a_missing_text_encoder_are_refused(tiny_data_folder, tmp_path):
-    with pytest.raises(ValueError, match=r"Unknown stage or size 'vq'.*Stages: rvq, masked"):
+def test_unknown_names_and_a_missing_text_encoder_are_refused(trained, tiny_data_folder, tmp_path):
+    with pytest.raises(ValueError, match=r"Unknown stage 'vq'\. Stages: rvq, masked"):
         train("vq", tiny_data_folder, tmp_path)
+    with pytest.raises(ValueError, match=r"Stage 'rvq' has no size 'huge'\. Sizes: small, paper, tiny"):
+        train_stage("rvq", data=tiny_data_folder, size="huge", root=tmp_path, progress=False)
     with pytest.raises(FileNotFoundError, match="no HumanML3D-style folder"):
         train("rvq", tmp_path / "nowhere", tmp_path)
     with pytest.raises(ValueError, match="`text_encoder` is needed to train 'masked'"):
-        train_stage("masked", data=tiny_data_folder, size="tiny", root=tmp_path, progress=False)
+        train_stage("masked", data=tiny_data_folder, size="tiny", root=trained, progress=False)
 
 
 @pytest.mark.parametrize("split", ["train", "val"])

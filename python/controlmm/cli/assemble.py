@@ -35,7 +35,7 @@ def assemble(
     from controlmm.models.residual_transformer import ResidualTransformer
     from controlmm.pipelines import ControlMM
     from controlmm.training.run_folder import SETTINGS_FILE
-    from controlmm.training.stages import load_tokenizer
+    from controlmm.training.stage import load_tokenizer
 
     tokenizer, normalizer = load_tokenizer(root)
     pipeline = ControlMM(

@@ -9,19 +9,23 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from controlmm.training.registry import MODULES
+
 if TYPE_CHECKING:
     from controlmm.text import TextEncoder
 
 COMMAND_FILE = "command.txt"  # in the run folder: every command line that worked on it
 _INTERRUPTED = 130  # exit code of a command that Ctrl-C ended
 
-_Stage = Literal["rvq", "masked", "residual", "control"]
 _Size = Literal["small", "paper", "tiny"]
 _Text = Literal["minilm", "clip", "hashing"]
 
 
 def train(
-    stage: Annotated[_Stage, typer.Argument(help="Train them in this order; each needs the ones before.")],
+    stage: Annotated[
+        str,
+        typer.Argument(help=f"One of: {', '.join(MODULES)}. Most need ones before them, trained already."),
+    ],
     data: Annotated[Path, typer.Option(help="HumanML3D-style folder, see `controlmm prepare`.")],
     out: Annotated[Path, typer.Option(help="Folder of the model; the stage gets a run folder in it.")],
     config: Annotated[_Size, typer.Option(help="Size of the networks and length of the training.")] = "small",
@@ -42,6 +46,7 @@ def train(
     import torch
 
     from controlmm.data import MotionFolder
+    from controlmm.training.registry import load_stage
     from controlmm.training.stages import train_stage
 
     if threads is not None:
@@ -49,7 +54,7 @@ def train(
     MotionFolder(data)  # before anything is written: a missing folder leaves no trace of a run
     given = {"steps": steps, "batch_size": batch_size, "learning_rate": learning_rate, "seed": seed}
     changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    encoder = None if stage == "rvq" else _load_encoder(text, text_folder, out)
+    encoder = _load_encoder(text, text_folder, out) if load_stage(stage).uses_text else None
     _store_command(out / stage)
     try:
         with _validations_above_the_bar(quiet=quiet):

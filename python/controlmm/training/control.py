@@ -16,7 +16,9 @@ from controlmm.ops import masked_consistency_loss, recover_joints
 from controlmm.training import masked
 from controlmm.training.control_masks import mixed_masks
 from controlmm.training.corruption import corrupt_tokens
+from controlmm.training.loop import Recipe
 from controlmm.training.masked import token_cross_entropy
+from controlmm.training.stage import Stage, StageInputs, best_weights, by_size, load_tokenizer
 from controlmm.training.tokens import TokenBatch, TokenSampler
 
 SETTINGS = {
@@ -92,3 +94,13 @@ class ControlRecipe:
         return recover_joints(
             self.decoder.normalizer.denormalize(features), joints=self.decoder.normalizer.skeleton.num_joints
         )
+
+
+def _build(config: ControlBranchConfig, inputs: StageInputs) -> Recipe:
+    decoder = MotionDecoder(*load_tokenizer(inputs.root))
+    base = MaskedTransformer.from_pretrained(best_weights(inputs.root, "masked"))
+    config = config.for_skeleton(decoder.normalizer.skeleton)
+    return ControlRecipe(config, base, decoder, *inputs.token_samplers())
+
+
+STAGE = Stage("control", _build, by_size(ControlBranchConfig), SETTINGS, ("rvq", "masked"))

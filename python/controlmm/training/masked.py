@@ -10,7 +10,9 @@ from torch.nn.functional import cross_entropy
 from controlmm.models.masked_transformer import MaskedTransformer, MaskedTransformerConfig
 from controlmm.nn.trunk import drop_text
 from controlmm.training.corruption import corrupt_tokens
+from controlmm.training.loop import Recipe
 from controlmm.training.settings import TrainingSettings
+from controlmm.training.stage import Stage, StageInputs, by_size
 from controlmm.training.tokens import TokenBatch, TokenSampler
 
 SETTINGS = {
@@ -80,3 +82,11 @@ class MaskedRecipe:
 def token_cross_entropy(logits: Tensor, ids: Tensor) -> Tensor:
     """Mean cross-entropy over the positions whose id is not -1. ``logits`` (B, L, K), ``ids`` (B, L)."""
     return cross_entropy(logits.flatten(0, 1), ids.flatten(), ignore_index=-1)
+
+
+def _build(config: MaskedTransformerConfig, inputs: StageInputs) -> Recipe:
+    assert inputs.text_encoder is not None  # the stage uses text
+    return MaskedRecipe(config.for_text(inputs.text_encoder.dim), *inputs.token_samplers())
+
+
+STAGE = Stage("masked", _build, by_size(MaskedTransformerConfig), SETTINGS, ("rvq",))

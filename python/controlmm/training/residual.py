@@ -13,7 +13,9 @@ from torch import Tensor
 from controlmm.models.residual_transformer import ResidualTransformer, ResidualTransformerConfig
 from controlmm.nn.trunk import drop_text
 from controlmm.training import masked
+from controlmm.training.loop import Recipe
 from controlmm.training.masked import token_cross_entropy
+from controlmm.training.stage import Stage, StageInputs, by_size
 from controlmm.training.tokens import TokenBatch, TokenSampler
 
 SETTINGS = {
@@ -70,3 +72,11 @@ def random_layers(count: int, num_quantizers: int) -> Int[Tensor, "B"]:
     """Layers 1..Q-1, early ones more often: ``1 + round((1 - cos(pi u / 2)) (Q - 2))``, u uniform."""
     progress = 1 - torch.cos(0.5 * math.pi * torch.rand(count))
     return 1 + (progress * (num_quantizers - 2)).round().long()
+
+
+def _build(config: ResidualTransformerConfig, inputs: StageInputs) -> Recipe:
+    assert inputs.text_encoder is not None  # the stage uses text
+    return ResidualRecipe(config.for_text(inputs.text_encoder.dim), *inputs.token_samplers())
+
+
+STAGE = Stage("residual", _build, by_size(ResidualTransformerConfig), SETTINGS, ("rvq",))

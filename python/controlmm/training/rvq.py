@@ -15,7 +15,9 @@ from controlmm.models.rvq_vae import RvqVae, RvqVaeConfig
 from controlmm.motion.layout import feature_layout
 from controlmm.motion.normalizer import Normalizer
 from controlmm.ops import recover_joints
+from controlmm.training.loop import Recipe
 from controlmm.training.settings import TrainingSettings
+from controlmm.training.stage import NORMALIZER_FILE, Stage, StageInputs, by_size
 from controlmm.training.windows import WindowSampler
 
 WINDOW = 64  # frames
@@ -117,3 +119,16 @@ def reconstruction_errors(
         errors.append((global_error.mean().item(), local_error.mean().item()))
     mean = torch.tensor(errors).mean(0)
     return {"global": mean[0].item(), "local": mean[1].item(), "score": (mean[1] + 0.1 * mean[0]).item()}
+
+
+def _build(config: RvqVaeConfig, inputs: StageInputs) -> Recipe:
+    if not inputs.train_clips:
+        raise ValueError("The training split has no readable clip.")
+    normalizer = Normalizer.fit(clip.features for clip in inputs.train_clips)
+    inputs.root.mkdir(parents=True, exist_ok=True)
+    normalizer.save(inputs.root / NORMALIZER_FILE)
+    config = config.for_features(normalizer.skeleton.feature_dim)
+    return RvqRecipe(config, normalizer, inputs.train_clips, inputs.val_clips)
+
+
+STAGE = Stage("rvq", _build, by_size(RvqVaeConfig), SETTINGS, uses_text=False)

@@ -1,0 +1,101 @@
+"""What a training stage is, and what the builder of its recipe may ask for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor
+
+from controlmm.data.clip import FeatureClip
+from controlmm.data.folder import MotionFolder
+from controlmm.models.rvq_vae import RvqVae
+from controlmm.motion.normalizer import Normalizer
+from controlmm.text import TextEncoder, encode_all
+from controlmm.training.loop import Recipe
+from controlmm.training.settings import TrainingSettings
+from controlmm.training.tokens import MIN_FRAMES, TokenSampler
+
+NORMALIZER_FILE = "normalizer.safetensors"
+SIZES = ("small", "paper", "tiny")
+_MIN_FRAMES_KIT = 24  # KIT-ML's clips are at 12.5 fps, so its shortest are shorter
+
+
+@dataclass(frozen=True)
+class StageInputs:
+    """Data and earlier stages, as the builder of a recipe sees them."""
+
+    root: Path  # of all stages of one model
+    folder: MotionFolder
+    train_clips: Sequence[FeatureClip]
+    val_clips: Sequence[FeatureClip]
+    text_encoder: TextEncoder | None = None  # set for stages that use text
+    progress: bool = True
+
+    def text_features(self) -> dict[str, Float[Tensor, "E"]]:
+        """The text encoder's pooled vector of every caption; cached beside the data."""
+        assert self.text_encoder is not None  # `train_stage` asks for it
+        splits = (self.train_clips, self.val_clips)
+        texts = sorted({caption.text for clips in splits for clip in clips for caption in clip.captions})
+        cache = self.folder.path / f"text_{self.text_encoder.name}.safetensors"
+        features = encode_all(texts, self.text_encoder, cache, progress=self.progress)
+        return dict(zip(texts, features, strict=True))
+
+    def token_samplers(self) -> tuple[TokenSampler, TokenSampler]:
+        """Training and validation clips as tokens of the stage ``rvq``, with their captions."""
+        tokenizer, normalizer = load_tokenizer(self.root)
+        features = self.text_features()
+        shortest = MIN_FRAMES if normalizer.skeleton.unit == "m" else _MIN_FRAMES_KIT
+        train, val = (
+            TokenSampler(clips, normalizer, tokenizer, features, progress=self.progress, min_frames=shortest)
+            for clips in (self.train_clips, self.val_clips)
+        )
+        return train, val
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One network's training: its sizes, and how its recipe is made of data and earlier stages.
+
+    A module of :mod:`controlmm.training` that trains a network offers one as ``STAGE``; the table in
+    ``registry.py`` names the module.
+    """
+
+    name: str  # also the run folder's
+    build: Callable[[Any, StageInputs], Recipe]  # (network configuration, inputs)
+    configs: Mapping[str, Any]  # network configuration by size
+    settings: Mapping[str, TrainingSettings]  # by size
+    needs: tuple[str, ...] = ()  # stages that must be trained before, in the same root
+    uses_text: bool = field(default=True, kw_only=True)
+
+
+def by_size(config_class: Any) -> dict[str, Any]:
+    """The configurations that a network's class offers under the names of ``SIZES``."""
+    return {size: getattr(config_class, size)() for size in SIZES}
+
+
+def best_weights(root: Path, stage: str) -> Path:
+    """Folder of the best weights of a trained stage.
+
+    Raises:
+        FileNotFoundError: If the stage is not trained yet.
+    """
+    folder = root / stage / "best"
+    if not folder.is_dir():
+        raise FileNotFoundError(
+            f"{root / stage} holds no trained stage. Run `controlmm train {stage}` with the same --out first."
+        )
+    return folder
+
+
+def load_tokenizer(root: str | Path) -> tuple[RvqVae, Normalizer]:
+    """The trained tokenizer of ``root`` and its feature statistics.
+
+    Raises:
+        FileNotFoundError: If the stage ``rvq`` is not trained yet.
+    """
+    root = Path(root)
+    return RvqVae.from_pretrained(best_weights(root, "rvq")), Normalizer.load(root / NORMALIZER_FILE)
