@@ -1,0 +1,140 @@
+"""The public call, which every pipeline shares: checks first, then latents, then motions."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from pathlib import Path
+from typing import ClassVar
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from controlmm.controls import Control
+from controlmm.generation.editing import Progress
+from controlmm.generation.motion_decoder import MotionDecoder
+from controlmm.generation.noise import clip_seeds
+from controlmm.motion.skeleton import Skeleton
+from controlmm.nn.checkpoint import PretrainedModel
+from controlmm.pipelines import folder as files
+from controlmm.pipelines.checks import check_sampling
+from controlmm.pipelines.output import GenerationResult
+from controlmm.pipelines.presets import Preset, resolve_preset
+from controlmm.pipelines.scene import Scene
+from controlmm.text import TextEncoder
+
+MAX_FRAMES = 196
+
+
+class MotionPipeline(ABC):
+    """Text plus 3D control in, motions out. A subclass says how the latents of a batch are made."""
+
+    kind: ClassVar[str]  # in pipeline.json
+    decoder: MotionDecoder
+    text_encoder: TextEncoder
+
+    @abstractmethod
+    def generate_latents(
+        self,
+        text: Float[Tensor, "B E"],
+        *,
+        lengths: Sequence[int],
+        targets: Float[Tensor, "B T J 3"],
+        mask: Bool[Tensor, "B T J 3"],
+        seeds: Sequence[int],
+        preset: Preset,
+        progress: Progress | None = None,
+    ) -> Float[Tensor, "B L C"]:
+        """Latents of a batch of clips of different texts, lengths and targets (the networks' frame).
+
+        Raises:
+            ValueError: If a target lies after the end of its clip.
+        """
+
+    @abstractmethod
+    def networks(self) -> dict[str, PretrainedModel]:
+        """All networks by the names of their folders."""
+
+    @torch.no_grad()
+    def __call__(
+        self,
+        prompt: str,
+        *,
+        seconds: float | None = None,
+        frames: int | None = None,
+        controls: Sequence[Control] = (),
+        samples: int = 1,
+        preset: str | Preset = "balanced",
+        guidance_scale: float | None = None,
+        seed: int = 0,
+        progress: Progress | None = None,
+    ) -> GenerationResult:
+        """Generate ``samples`` motions.
+
+        Without height targets each motion is stood on the floor: its lowest joint touches y = 0.
+
+        Args:
+            prompt: What the person does, in words.
+            seconds: Length, 0.4 to 9.8 s; or pass ``frames`` (8 to 196, at 20 fps). 6 s without either.
+            frames: Length in frames.
+            controls: Targets in metres, Y up, ground at y = 0. The body starts facing +Z (its left is +X), at
+                x = z = 0 unless a control names the pelvis at frame 0. Contradicting or impossible frames are
+                refused.
+            samples: How many motions; sample ``i`` is the same however many are asked for.
+            preset: ``fast``, ``balanced``, ``accurate`` (the papers' iteration counts) or a :class:`Preset`.
+            guidance_scale: How strongly the text counts; ``None`` takes the preset's.
+            seed: Same seed, same motions.
+            progress: Called as ``progress(phase, done, total)`` during long loops.
+
+        Raises:
+            ValueError: If an argument is unusable; nothing has run then.
+        """
+        started = time.perf_counter()
+        check_sampling(samples=samples, seed=seed)
+        plan = resolve_preset(preset)
+        if guidance_scale is not None:
+            plan = dataclasses.replace(plan, guidance_scale=guidance_scale)
+        scene = Scene.of_call(
+            prompt,
+            controls,
+            seconds=seconds,
+            frames=frames,
+            skeleton=self.skeleton,
+            max_frames=MAX_FRAMES,
+        )
+        canonical = scene.canonical
+        latents = self.generate_latents(
+            self.text_encoder.encode([scene.prompt]).pooled.expand(samples, -1),
+            lengths=[scene.frames] * samples,
+            targets=canonical.targets.expand(samples, -1, -1, -1),
+            mask=canonical.mask.expand(samples, -1, -1, -1),
+            seeds=clip_seeds(seed, samples),
+            preset=plan,
+            progress=progress,
+        )
+        features = self.decoder.features(latents)[:, : scene.frames]
+        return scene.result(features, latents, seconds_taken=time.perf_counter() - started)
+
+    @property
+    def skeleton(self) -> Skeleton:
+        """The joints that motions have and controls may name."""
+        return self.decoder.normalizer.skeleton
+
+    @property
+    def num_parameters(self) -> int:
+        """Parameters of all networks, the text encoder not counted."""
+        return sum(p.numel() for network in self.networks().values() for p in network.parameters())
+
+    def save_pretrained(self, path: str | Path, *, dtype: torch.dtype = torch.float32) -> Path:
+        """Write the pipeline as a folder (safetensors and JSON); ``dtype=torch.float16`` halves it."""
+        folder = Path(path)
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, network in self.networks().items():
+            network.save_pretrained(folder / name, dtype=dtype)
+        self.decoder.normalizer.save(folder / files.NORMALIZER_FILE)
+        files.write_json(folder / files.TEXT_ENCODER_FILE, self.text_encoder.config())
+        files.write_json(folder / files.PIPELINE_FILE, {"kind": self.kind, "format": files.FORMAT})
+        return folder
