@@ -14,6 +14,7 @@ from controlmm.motion.skeleton import HUMANML3D, Skeleton
 
 MAX_HEIGHT = 0.05  # metres; lower in both frames of a pair means that the foot stands
 MIN_SPEED = 0.5  # metres a second along the ground
+_PUBLISHED_FPS = 20.0
 WINDOW = 5  # frames over which the speed is averaged, so that a single jump of the decoder does not count
 
 
@@ -41,13 +42,34 @@ def foot_skating_ratio(
         ValueError: If the shape is not that of the skeleton, or a length is not from 1 to ``T``.
     """
     lengths = _checked_lengths(joints, lengths, skeleton)
-    feet = joints[:, :, [skeleton.left_foot[1], skeleton.right_foot[1]]]
-    feet = feet * (0.001 if skeleton.unit == "mm" else 1.0)
     pair_counts = lengths - 1
     is_pair = torch.arange(joints.shape[1] - 1, device=joints.device) < pair_counts[:, None]  # (B, T-1)
-    slides = _slides(feet, is_pair, fps=skeleton.fps)
+    slides = _slides(_feet_in_metres(joints, skeleton), is_pair, fps=skeleton.fps)
     ratio: Tensor = slides.any(-1).sum(1) / pair_counts.clamp(min=1)
     return ratio
+
+
+def published_skating_ratio(
+    joints: Float[Tensor, "B T J 3"], *, skeleton: Skeleton = HUMANML3D
+) -> Float[Tensor, "B"]:
+    """The ratio as the published scripts compute it, for comparison with their tables.
+
+    All ``T`` frames count, whatever the clip's length: give whole tensors padded to 196 frames, then 195 is
+    the divisor also of short clips. The frame rate is taken for 20, also of KIT-ML's 12.5 fps.
+
+    Raises:
+        ValueError: If the shape is not that of the skeleton.
+    """
+    lengths = _checked_lengths(joints, None, skeleton)
+    pairs = joints.shape[1] - 1
+    everywhere = torch.ones(len(joints), pairs, dtype=torch.bool)
+    ratio: Tensor = _slides(_feet_in_metres(joints, skeleton), everywhere, fps=_PUBLISHED_FPS).any(-1).sum(1)
+    return ratio / (lengths - 1).clamp(min=1)
+
+
+def _feet_in_metres(joints: Tensor, skeleton: Skeleton) -> Float[Tensor, "B T 2 3"]:
+    feet = joints[:, :, [skeleton.left_foot[1], skeleton.right_foot[1]]]
+    return feet * (0.001 if skeleton.unit == "mm" else 1.0)
 
 
 def _slides(
