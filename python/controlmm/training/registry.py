@@ -19,6 +19,7 @@ MODULES = {
     "masked": "masked",
     "residual": "residual",
     "control": "control",
+    "evaluator": "evaluator",
 }
 CONTROLMM_STAGES = ("rvq", "masked", "residual", "control")  # that `controlmm assemble` puts together
 
