@@ -1,4 +1,4 @@
-"""The four training stages on a tiny folder, from statistics to a pipeline that generates."""
+"""The training stages of ControlMM on a tiny folder, from statistics to a pipeline that generates."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from controlmm.motion.normalizer import Normalizer
 from controlmm.pipelines import ControlMM
 from controlmm.text.hashing import HashingTextEncoder
 from controlmm.training import loop
-from controlmm.training.registry import CONTROLMM_STAGES as STAGES
 from controlmm.training.registry import MODULES, load_stage
 from controlmm.training.run_folder import RunFolder
 from controlmm.training.stage import load_tokenizer
 from controlmm.training.stages import train_stage
 
+STAGES = ("rvq", "rvq-decoder", "masked", "residual", "control")
 QUICK = {"steps": 10, "validate_every": 5}
 
 
@@ -37,7 +37,7 @@ def train(stage, data, root, **changes):
 
 @pytest.fixture(scope="module")
 def trained(tiny_data_folder, tmp_path_factory):
-    """A root folder with all four stages trained for ten steps."""
+    """A root folder with all stages trained for ten steps."""
     root = tmp_path_factory.mktemp("trained")
     for stage in STAGES:
         train(stage, tiny_data_folder, root)
@@ -98,13 +98,14 @@ class KilledError(Exception):
 def test_a_killed_and_resumed_stage_equals_the_unbroken_one_bit_by_bit(
     trained, tiny_data_folder, tmp_path, monkeypatch, stage
 ):
-    for name in ("normalizer.safetensors", "rvq/best", "masked/best"):
-        if stage != "rvq":
-            (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-            (tmp_path / name).symlink_to(trained / name)
+    tokenizer = ("normalizer.safetensors", "rvq/best")
+    earlier = {"rvq": (), "rvq-decoder": tokenizer}.get(
+        stage, (*tokenizer, "rvq-decoder/best", "masked/best")
+    )
+    for name in {*earlier} - {f"{stage}/best"}:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).symlink_to(trained / name)
     run = tmp_path / stage
-    if (run / "best").is_symlink():
-        (run / "best").unlink()
     take_step = loop._take_step
 
     def killed_at_eight(recipe, settings, optimizer, parameters, step):
@@ -140,7 +141,7 @@ def test_other_data_is_not_mixed_into_a_run(trained, tiny_data_folder, walk, tmp
 
 
 def test_unknown_names_and_a_missing_text_encoder_are_refused(trained, tiny_data_folder, tmp_path):
-    with pytest.raises(ValueError, match=r"Unknown stage 'vq'\. Stages: rvq, masked"):
+    with pytest.raises(ValueError, match=r"Unknown stage 'vq'\. Stages: rvq, rvq-decoder, masked"):
         train("vq", tiny_data_folder, tmp_path)
     with pytest.raises(ValueError, match=r"Stage 'rvq' has no size 'huge'\. Sizes: small, paper, tiny"):
         train_stage("rvq", data=tiny_data_folder, size="huge", root=tmp_path, progress=False)

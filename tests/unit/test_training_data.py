@@ -14,6 +14,7 @@ from controlmm.motion.skeleton import HUMANML3D
 from controlmm.training.control_masks import cross_masks, mixed_masks, random_frames, trajectory_masks
 from controlmm.training.corruption import corrupt_tokens
 from controlmm.training.residual import random_layers
+from controlmm.training.rvq import layer_perplexities
 from controlmm.training.tokens import TokenSampler
 from controlmm.training.windows import WindowSampler, source_weights
 
@@ -232,3 +233,11 @@ def test_clips_without_captions_or_length_are_refused(identity, tokenizer):
     clips = [clip_of("a", 39), clip_of("b", 200), FeatureClip("c", torch.zeros(60, 263), ())]
     with pytest.raises(ValueError, match="No clip has a caption and 40 to 199 frames"):
         TokenSampler(clips, identity, tokenizer, TEXT, progress=False)
+
+
+def test_layer_perplexity_counts_the_codes_in_use():
+    """One code: 1. Four codes alike: 4. Shares 3/4 and 1/4: exp(-(3/4 ln 3/4 + 1/4 ln 1/4))."""
+    ids = torch.tensor([[7, 0, 2], [7, 1, 2], [7, 2, 2], [7, 3, 5]])
+    entropy = -(0.75 * math.log(0.75) + 0.25 * math.log(0.25))
+    assert list(layer_perplexities(ids).values()) == pytest.approx([1.0, 4.0, math.exp(entropy)])
+    assert list(layer_perplexities(ids)) == ["perplexity_0", "perplexity_1", "perplexity_2"]

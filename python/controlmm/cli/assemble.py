@@ -11,9 +11,6 @@ import typer
 if TYPE_CHECKING:
     from controlmm.text import TextEncoder
 
-# Folder of each network in a model, and the stage that trained it.
-_STAGE_OF = {"tokenizer": "rvq", "transformer": "masked", "residual": "residual", "control": "control"}
-
 
 def assemble(
     root: Annotated[Path, typer.Argument(help="Folder that `controlmm train --out` filled.")],
@@ -27,7 +24,7 @@ def assemble(
         Path | None, typer.Option(help="Where the text encoder's weights are, if not in their package.")
     ] = None,
 ) -> None:
-    """Put the best weights of all four stages together, to generate with."""
+    """Put the best weights of the stages together, to generate with."""
     import torch
 
     from controlmm.models.control_branch import ControlBranch
@@ -35,7 +32,7 @@ def assemble(
     from controlmm.models.residual_transformer import ResidualTransformer
     from controlmm.pipelines import ControlMM
     from controlmm.training.run_folder import SETTINGS_FILE
-    from controlmm.training.stage import load_tokenizer
+    from controlmm.training.stage import load_tokenizer, tokenizer_stage
 
     tokenizer, normalizer = load_tokenizer(root)
     pipeline = ControlMM(
@@ -47,8 +44,15 @@ def assemble(
         text_encoder=_text_encoder(root, text, text_folder),
     )
     pipeline.save_pretrained(out, dtype=torch.float16 if half else torch.float32)
-    for network, stage in _STAGE_OF.items():
-        shutil.copyfile(root / stage / SETTINGS_FILE, out / network / SETTINGS_FILE)
+    stages = {
+        "tokenizer": tokenizer_stage(root),
+        "transformer": "masked",
+        "residual": "residual",
+        "control": "control",
+    }
+    for network, stage in stages.items():
+        if (root / stage / SETTINGS_FILE).is_file():  # not there when a stage came from a model without it
+            shutil.copyfile(root / stage / SETTINGS_FILE, out / network / SETTINGS_FILE)
     size = sum(file.stat().st_size for file in out.rglob("*") if file.is_file()) / 1e6
     typer.echo(f"{out}: {size:.1f} MB, {pipeline.num_parameters / 1e6:.2f} million parameters")
     typer.echo(f'Next: controlmm generate "a person walks forward" --model {out}')

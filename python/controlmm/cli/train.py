@@ -33,6 +33,13 @@ def train(
     text_folder: Annotated[
         Path | None, typer.Option(help="Where the text encoder's weights are, if not in their package.")
     ] = None,
+    start_from: Annotated[
+        Path | None,
+        typer.Option(
+            help="Train these weights further: a network's folder, or a whole model's, which also lends the "
+            "earlier stages that --out lacks."
+        ),
+    ] = None,
     steps: Annotated[int | None, typer.Option(help="Optimiser steps.", show_default=False)] = None,
     batch_size: Annotated[int | None, typer.Option(help="Clips a step.", show_default=False)] = None,
     learning_rate: Annotated[float | None, typer.Option(help="Peak rate.", show_default=False)] = None,
@@ -65,6 +72,7 @@ def train(
                 root=out,
                 text_encoder=encoder,
                 changes=changes,
+                start_from=start_from,
                 progress=not quiet,
             )
     except KeyboardInterrupt:

@@ -103,4 +103,4 @@ def _build(config: ControlBranchConfig, inputs: StageInputs) -> Recipe:
     return ControlRecipe(config, base, decoder, *inputs.token_samplers())
 
 
-STAGE = Stage("control", _build, by_size(ControlBranchConfig), SETTINGS, ("rvq", "masked"))
+STAGE = Stage("control", _build, by_size(ControlBranchConfig), SETTINGS, ("rvq", "masked"), network="control")

@@ -89,4 +89,4 @@ def _build(config: MaskedTransformerConfig, inputs: StageInputs) -> Recipe:
     return MaskedRecipe(config.for_text(inputs.text_encoder.dim), *inputs.token_samplers())
 
 
-STAGE = Stage("masked", _build, by_size(MaskedTransformerConfig), SETTINGS, ("rvq",))
+STAGE = Stage("masked", _build, by_size(MaskedTransformerConfig), SETTINGS, ("rvq",), network="transformer")

@@ -16,6 +16,7 @@ _PACKAGE = "controlmm.training"
 # name: module of controlmm.training; in the order in which a model is trained
 MODULES = {
     "rvq": "rvq",
+    "rvq-decoder": "rvq_decoder",
     "masked": "masked",
     "residual": "residual",
     "control": "control",

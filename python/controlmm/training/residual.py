@@ -79,4 +79,4 @@ def _build(config: ResidualTransformerConfig, inputs: StageInputs) -> Recipe:
     return ResidualRecipe(config.for_text(inputs.text_encoder.dim), *inputs.token_samplers())
 
 
-STAGE = Stage("residual", _build, by_size(ResidualTransformerConfig), SETTINGS, ("rvq",))
+STAGE = Stage("residual", _build, by_size(ResidualTransformerConfig), SETTINGS, ("rvq",), network="residual")

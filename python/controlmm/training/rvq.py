@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import smooth_l1_loss
 
@@ -21,7 +21,7 @@ from controlmm.training.stage import NORMALIZER_FILE, Stage, StageInputs, by_siz
 from controlmm.training.windows import WindowSampler
 
 WINDOW = 64  # frames
-_POSITION_WEIGHT = 0.5
+POSITION_WEIGHT = 0.5
 _COMMITMENT_WEIGHT = 0.02
 
 SETTINGS = {
@@ -73,7 +73,7 @@ class RvqRecipe:
         decoded = decoded.float()
         reconstruction = smooth_l1_loss(decoded, target)
         positions = smooth_l1_loss(decoded[..., self._positions], target[..., self._positions])
-        loss = reconstruction + _POSITION_WEIGHT * positions + _COMMITMENT_WEIGHT * quantized.commitment
+        loss = reconstruction + POSITION_WEIGHT * positions + _COMMITMENT_WEIGHT * quantized.commitment
         losses = {
             "reconstruction": reconstruction,
             "positions": positions,
@@ -104,21 +104,40 @@ def reconstruction_errors(
     """Mean joint position error of encode -> quantise -> decode over whole clips (each cut to whole tokens).
 
     Returns ``global`` and ``local`` (relative to the root, turned into its heading) in metres, averaged over
-    frames and joints, then clips, and ``score``, the local error plus a tenth of the global one.
+    frames and joints, then clips; ``score``, the local error plus a tenth of the global one; and for every
+    layer ``perplexity_0``, ...: how many codes are in use, as e to the entropy of their shares.
     """
-    errors = []
+    errors, ids = [], []
     joints = normalizer.skeleton.num_joints
     for clip in clips:
         frames = len(clip.features) // model.config.downsample * model.config.downsample
         target = clip.features[None, :frames]
-        decoded = normalizer.denormalize(model(normalizer.normalize(target))[0].float())
+        decoded, quantized = model(normalizer.normalize(target))
+        decoded = normalizer.denormalize(decoded.float())
+        ids.append(quantized.ids[0])
         global_error = (recover_joints(decoded, joints=joints) - recover_joints(target, joints=joints)).norm(
             dim=-1
         )
         local_error = (decoded - target)[..., 4 : 4 + 3 * (joints - 1)].unflatten(-1, (-1, 3)).norm(dim=-1)
         errors.append((global_error.mean().item(), local_error.mean().item()))
     mean = torch.tensor(errors).mean(0)
-    return {"global": mean[0].item(), "local": mean[1].item(), "score": (mean[1] + 0.1 * mean[0]).item()}
+    score = (mean[1] + 0.1 * mean[0]).item()
+    return {
+        "global": mean[0].item(),
+        "local": mean[1].item(),
+        "score": score,
+        **layer_perplexities(torch.cat(ids)),
+    }
+
+
+def layer_perplexities(ids: Int[Tensor, "N Q"]) -> dict[str, float]:
+    """``perplexity_q`` of each layer's codes: 1 when one code serves all, K when all serve alike."""
+    perplexities = {}
+    for layer, used in enumerate(ids.unbind(1)):
+        share = used.bincount().double() / len(used)
+        entropy = -torch.special.xlogy(share, share).sum()
+        perplexities[f"perplexity_{layer}"] = entropy.exp().item()
+    return perplexities
 
 
 def _build(config: RvqVaeConfig, inputs: StageInputs) -> Recipe:
@@ -131,4 +150,12 @@ def _build(config: RvqVaeConfig, inputs: StageInputs) -> Recipe:
     return RvqRecipe(config, normalizer, inputs.train_clips, inputs.val_clips)
 
 
-STAGE = Stage("rvq", _build, by_size(RvqVaeConfig), SETTINGS, uses_text=False)
+STAGE = Stage(
+    "rvq",
+    _build,
+    by_size(RvqVaeConfig),
+    SETTINGS,
+    network="tokenizer",
+    uses_text=False,
+    starts_from_weights=False,
+)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -69,7 +70,9 @@ class Stage:
     configs: Mapping[str, Any]  # network configuration by size
     settings: Mapping[str, TrainingSettings]  # by size
     needs: tuple[str, ...] = ()  # stages that must be trained before, in the same root
+    network: str | None = field(default=None, kw_only=True)  # its folder in the folder of a whole model
     uses_text: bool = field(default=True, kw_only=True)
+    starts_from_weights: bool = field(default=True, kw_only=True)  # whether a model's weights are enough
 
 
 def by_size(config_class: Any) -> dict[str, Any]:
@@ -92,10 +95,26 @@ def best_weights(root: Path, stage: str) -> Path:
 
 
 def load_tokenizer(root: str | Path) -> tuple[RvqVae, Normalizer]:
-    """The trained tokenizer of ``root`` and its feature statistics.
+    """The trained tokenizer of ``root``, with its refined decoder if there is one, and the statistics.
 
     Raises:
         FileNotFoundError: If the stage ``rvq`` is not trained yet.
+        ValueError: If the refined decoder belongs to another tokenizer.
     """
     root = Path(root)
-    return RvqVae.from_pretrained(best_weights(root, "rvq")), Normalizer.load(root / NORMALIZER_FILE)
+    tokenizer = RvqVae.from_pretrained(best_weights(root, "rvq"))
+    normalizer = Normalizer.load(root / NORMALIZER_FILE)
+    if tokenizer_stage(root) == "rvq":
+        return tokenizer, normalizer
+    refined = RvqVae.from_pretrained(best_weights(root, "rvq-decoder"))
+    if refined.config != tokenizer.config or not torch.equal(refined.base_codes, tokenizer.base_codes):
+        raise ValueError(
+            f"{root / 'rvq-decoder'} refines another tokenizer than {root / 'rvq'}. "
+            "Remove it, or train it again."
+        )
+    return refined, normalizer
+
+
+def tokenizer_stage(root: Path) -> str:
+    """The stage that the tokenizer of ``root`` comes from: ``rvq``, or ``rvq-decoder`` that refined it."""
+    return "rvq-decoder" if (root / "rvq-decoder" / "best").is_dir() else "rvq"

@@ -12,10 +12,12 @@ import torch
 
 from controlmm.data.clip import FeatureClip
 from controlmm.data.folder import MotionFolder
+from controlmm.nn.checkpoint import CONFIG_FILE, WEIGHTS_FILE, read_config
 from controlmm.text import TextEncoder
 from controlmm.training.loop import Recipe, train
 from controlmm.training.registry import load_stage
 from controlmm.training.stage import Stage, StageInputs, best_weights
+from controlmm.training.starting import adopt_earlier_stages, load_starting_weights, starting_folder
 
 
 def train_stage(
@@ -26,6 +28,7 @@ def train_stage(
     root: str | Path,
     text_encoder: TextEncoder | None = None,
     changes: dict[str, Any] | None = None,
+    start_from: str | Path | None = None,
     progress: bool = True,
 ) -> Path:
     """Train one stage into ``root/<name>`` or go on where it was stopped. Returns the run folder.
@@ -37,6 +40,9 @@ def train_stage(
         root: Folder of all stages of one model.
         text_encoder: Needed by stages that use text; its features are cached beside the data.
         changes: Fields of :class:`TrainingSettings` to override.
+        start_from: Train given weights further: a network's folder, or the folder of a whole model, which
+            also lends the earlier stages that ``root`` lacks (they are copied there). The network keeps its
+            configuration; ``size`` then only names the settings.
         progress: Show progress bars.
 
     Raises:
@@ -47,6 +53,11 @@ def train_stage(
     config, settings = _of_size(stage, size)
     settings = replace(settings, **(changes or {}))
     folder = MotionFolder(data)
+    start = None
+    if start_from is not None:
+        start = starting_folder(Path(start_from), stage)
+        adopt_earlier_stages(Path(start_from), root, stage)
+        config = read_config(start / CONFIG_FILE, type(config))
     for need in stage.needs:
         best_weights(root, need)
     if stage.uses_text and text_encoder is None:
@@ -61,7 +72,9 @@ def train_stage(
     )
     torch.manual_seed(settings.seed)  # fresh weights are a function of the seed
     recipe = stage.build(config, inputs)
-    train(_Described(recipe, size, inputs), settings, root / name, progress=progress)
+    if start is not None:
+        load_starting_weights(recipe.model, start)
+    train(_Described(recipe, size, inputs, start), settings, root / name, progress=progress)
     return root / name
 
 
@@ -74,8 +87,9 @@ def _of_size(stage: Stage, size: str) -> tuple[Any, Any]:
 class _Described:
     """A recipe that also says which clips it was given, so that a run names its data."""
 
-    def __init__(self, recipe: Recipe, size: str, inputs: StageInputs) -> None:
+    def __init__(self, recipe: Recipe, size: str, inputs: StageInputs, start: Path | None) -> None:
         self._recipe, self._size = recipe, size
+        self._start = {} if start is None else {"start_from_sha256": _file_hash(start / WEIGHTS_FILE)}
         self._data = {
             name: {"clips": len(clips), "sha256": _hash(clips)}
             for name, clips in (("train", inputs.train_clips), ("val", inputs.val_clips))
@@ -83,7 +97,12 @@ class _Described:
         self.model, self.loss, self.validate = recipe.model, recipe.loss, recipe.validate
 
     def describe(self) -> dict[str, Any]:
-        return {**self._recipe.describe(), "size": self._size, "data": self._data}
+        return {**self._recipe.describe(), "size": self._size, **self._start, "data": self._data}
+
+
+def _file_hash(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _hash(clips: Sequence[FeatureClip]) -> str:

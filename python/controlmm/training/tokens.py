@@ -77,7 +77,7 @@ class TokenSampler:
         ]
         if not self._items:
             raise ValueError(f"No clip has a caption and {min_frames} to {MAX_FRAMES} frames.")
-        self._ids = _tokenize(self._features, tokenizer, progress=progress)
+        self._ids = tokenize(self._features, tokenizer, progress=progress)
         sources = [clips[item.clip].source for item in self._items]
         self._weights = source_weights(sources, [1] * len(self._items))
         self._frames = torch.tensor([item.end - item.start for item in self._items])
@@ -86,14 +86,8 @@ class TokenSampler:
         return len(self._items)
 
     def sample(self, count: int) -> TokenBatch:
-        """``count`` random crops of about the same length, from torch's global random state.
-
-        A first item is drawn freely and the others near its length, which keeps every item's share nearly
-        as it was and spends little on padding.
-        """
-        first = self._frames[torch.multinomial(self._weights, 1)]
-        is_near = (self._frames - first).abs() <= _LENGTH_BAND * first
-        chosen = torch.multinomial(self._weights * is_near, count, replacement=True).tolist()
+        """``count`` random crops of about the same length, from torch's global random state."""
+        chosen = near_lengths(self._frames, self._weights, count)
         return self._collate([self._random_crop(self._items[index]) for index in chosen])
 
     def whole(self, indices: Sequence[int]) -> TokenBatch:
@@ -152,8 +146,20 @@ def _by_kind(captions: Sequence[Caption]) -> tuple[tuple[str, ...], ...]:
     return tuple(tuple(texts) for texts in kinds.values())
 
 
+def near_lengths(lengths: Int[Tensor, "N"], weights: Float[Tensor, "N"], count: int) -> list[int]:
+    """``count`` random indices (with replacement) of items of about the same length.
+
+    A first item is drawn freely and the others near its length, which keeps every item's share nearly as it
+    was and spends little on padding.
+    """
+    first = lengths[torch.multinomial(weights, 1)]
+    is_near = (lengths - first).abs() <= _LENGTH_BAND * first
+    chosen: list[int] = torch.multinomial(weights * is_near, count, replacement=True).tolist()
+    return chosen
+
+
 @torch.no_grad()
-def _tokenize(
+def tokenize(
     features: Sequence[Float[Tensor, "T D"]], tokenizer: RvqVae, *, progress: bool
 ) -> list[list[Int[Tensor, "L Q"]]]:
     """Ids of every clip at every frame offset. Similar lengths go together, so little is spent on padding."""

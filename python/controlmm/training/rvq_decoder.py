@@ -1,0 +1,137 @@
+"""Recipe that refines the tokenizer's decoder alone: encoder and codes stay, so tokens keep their meaning.
+
+The tokenizer is trained on windows of 64 frames. Whole clips are longer, where errors of the root add up, or
+shorter, where the zeros around a clip are near everywhere. Here the decoder sees whole clips of every length.
+Transformers that were trained on the tokens stay valid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import smooth_l1_loss
+from torch.nn.utils.rnn import pad_sequence
+
+from controlmm.data.clip import FeatureClip
+from controlmm.models.rvq_vae import RvqVae, RvqVaeConfig, frame_mask
+from controlmm.motion.layout import feature_layout
+from controlmm.motion.normalizer import Normalizer
+from controlmm.ops import recover_joints
+from controlmm.training.loop import Recipe
+from controlmm.training.rvq import POSITION_WEIGHT, reconstruction_errors
+from controlmm.training.settings import TrainingSettings
+from controlmm.training.stage import NORMALIZER_FILE, Stage, StageInputs, best_weights, by_size
+from controlmm.training.tokens import near_lengths, tokenize
+from controlmm.training.windows import source_weights
+
+SETTINGS = {
+    "paper": TrainingSettings(steps=20_000, batch_size=64, learning_rate=1e-4, warmup=200, bf16=False),
+    "small": TrainingSettings(
+        steps=3000, batch_size=32, learning_rate=3e-4, warmup=50, validate_every=250, checkpoint_every=125
+    ),
+    "tiny": TrainingSettings(
+        steps=20,
+        batch_size=8,
+        learning_rate=1e-3,
+        warmup=2,
+        validate_every=10,
+        checkpoint_every=5,
+        bf16=False,
+    ),
+}
+_LONGEST = 49  # tokens
+
+
+class RvqDecoderRecipe:
+    """Smooth-L1 reconstruction of whole clips from their codes, joint positions, global joints in metres.
+
+    As in the tokenizer's own training a share of the clips loses its upper layers of codes, so that the base
+    codes alone, which control is trained on, keep their motions.
+    """
+
+    def __init__(
+        self,
+        model: RvqVae,
+        normalizer: Normalizer,
+        train_clips: Sequence[FeatureClip],
+        val_clips: Sequence[FeatureClip],
+        *,
+        joint_weight: float = 1.0,
+        progress: bool = True,
+    ) -> None:
+        self.model = model
+        self.model.requires_grad_(False)
+        self.model.decoder.requires_grad_(True)
+        self.normalizer, self.joint_weight = normalizer, joint_weight
+        step = model.config.downsample
+        clips = [clip for clip in train_clips if len(clip.features) >= 2 * step]
+        self._val_clips = [clip for clip in val_clips if len(clip.features) >= step]
+        if not clips or not self._val_clips:
+            raise ValueError(f"Both splits need clips of at least {2 * step} frames.")
+        self._features = [normalizer.normalize(clip.features) for clip in clips]
+        self._ids = tokenize(self._features, model, progress=progress)
+        self._lengths = torch.tensor([len(clip.features) for clip in clips])
+        self._weights = source_weights([clip.source for clip in clips], self._lengths.tolist())
+        self._positions = feature_layout(normalizer.skeleton).local_positions
+
+    def loss(self, batch_size: int) -> dict[str, Tensor]:
+        """Losses of a random batch of whole clips."""
+        ids, target, frames = self._sample(batch_size)
+        decoded = self.model.decode(self.model.quantizer.lookup(ids), frames).float()
+        shown, wanted = decoded[frames], target[frames]
+        reconstruction = smooth_l1_loss(shown, wanted)
+        positions = smooth_l1_loss(shown[:, self._positions], wanted[:, self._positions])
+        joints = (self._joints(decoded) - self._joints(target)).norm(dim=-1)[frames].mean()
+        loss = reconstruction + POSITION_WEIGHT * positions + self.joint_weight * joints
+        return {"loss": loss, "reconstruction": reconstruction, "positions": positions, "joints": joints}
+
+    def validate(self) -> dict[str, float]:
+        """Joint errors over whole clips, see :func:`reconstruction_errors`."""
+        return reconstruction_errors(self.model, self.normalizer, self._val_clips)
+
+    def describe(self) -> dict[str, Any]:
+        """Options of this recipe."""
+        return {"stage": "rvq-decoder", "joint_weight": self.joint_weight}
+
+    def _sample(self, count: int) -> tuple[Int[Tensor, "B L Q"], Float[Tensor, "B T D"], Bool[Tensor, "B T"]]:
+        """``count`` clips of about the same length, each from one of its first few frames on."""
+        step = self.model.config.downsample
+        ids, targets = [], []
+        for clip in near_lengths(self._lengths, self._weights, count):
+            offset = int(torch.randint(step, ()))
+            tokens = self._ids[clip][offset]
+            start = int(torch.randint(max(0, len(tokens) - _LONGEST) + 1, ()))
+            chosen = tokens[start : start + _LONGEST].long()
+            if torch.rand(()) < self.model.config.quantize_dropout:
+                chosen[:, int(torch.randint(chosen.shape[1], ())) + 1 :] = -1
+            first = offset + step * start
+            ids.append(chosen)
+            targets.append(self._features[clip][first : first + step * len(chosen)])
+        target = pad_sequence(targets, batch_first=True)
+        frames = frame_mask(torch.tensor([len(x) for x in targets]), target.shape[1])
+        return pad_sequence(ids, batch_first=True, padding_value=-1), target, frames
+
+    def _joints(self, features: Float[Tensor, "B T D"]) -> Float[Tensor, "B T J 3"]:
+        skeleton = self.normalizer.skeleton
+        return recover_joints(self.normalizer.denormalize(features), joints=skeleton.num_joints)
+
+
+def _build(_: RvqVaeConfig, inputs: StageInputs) -> Recipe:
+    model = RvqVae.from_pretrained(best_weights(inputs.root, "rvq"))
+    normalizer = Normalizer.load(inputs.root / NORMALIZER_FILE)
+    return RvqDecoderRecipe(model, normalizer, inputs.train_clips, inputs.val_clips, progress=inputs.progress)
+
+
+STAGE = Stage(
+    "rvq-decoder",
+    _build,
+    by_size(RvqVaeConfig),  # not read: the sizes are those of the trained tokenizer
+    SETTINGS,
+    ("rvq",),
+    network="tokenizer",
+    uses_text=False,
+)
