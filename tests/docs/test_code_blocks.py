@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from published_layout import SMALL, write_published
 
 from controlmm.controls import load_controls
 from controlmm.pipelines.folder import PIPELINE_FILE, shipped_folder
@@ -76,7 +77,7 @@ BLOCKS = [block for document in DOCUMENTS for block in _blocks(document)]
 def folder_of(
     tmp_path_factory: pytest.TempPathFactory, walk: Callable[..., torch.Tensor]
 ) -> Callable[[Path], Path]:
-    """The folder in which a document's blocks run: its ``file:`` blocks, the examples, a few clips."""
+    """Where a document runs: its ``file:`` blocks, the examples, a few clips, published checkpoints."""
     made: dict[Path, Path] = {}
 
     def folder(document: Path) -> Path:
@@ -84,6 +85,7 @@ def folder_of(
             made[document] = tmp_path_factory.mktemp(document.stem)
             (made[document] / "examples").symlink_to(ROOT / "examples")
             _write_clips(made[document] / "joints", walk)
+            write_published(made[document] / "checkpoints" / "t2m", SMALL)
             for block in _blocks(document):
                 if block.note.startswith("file: "):
                     (made[document] / block.note.removeprefix("file: ")).write_text(block.text)
@@ -128,7 +130,7 @@ def test_control_files_are_readable(block: Block, tmp_path: Path) -> None:
 
 
 def test_every_document_and_language_is_covered() -> None:
-    assert {block.language for block in BLOCKS} == {"bash", "python", "json", "csv", "bibtex"}
+    assert {block.language for block in BLOCKS} == {"bash", "python", "json", "csv", "bibtex", "text"}
     assert len([block for block in BLOCKS if block.document.name == "README.md"]) >= 8
     fences = sum(document.read_text(encoding="utf-8").count("\n```") for document in DOCUMENTS)
     assert fences == 2 * len(BLOCKS)

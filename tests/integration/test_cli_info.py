@@ -15,7 +15,7 @@ from controlmm.nn.checkpoint import read_weights
 from controlmm.ops import build_info
 
 Command = Callable[..., str]
-COMMANDS = ("generate", "info", "controls", "prepare", "train", "plot", "assemble")
+COMMANDS = ("generate", "info", "controls", "prepare", "train", "plot", "assemble", "convert")
 
 
 def _lines(printed: str) -> dict[str, str]:

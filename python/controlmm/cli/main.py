@@ -13,6 +13,7 @@ from typer.core import TyperGroup
 
 from controlmm.cli.assemble import assemble
 from controlmm.cli.controls import controls_app
+from controlmm.cli.convert import convert
 from controlmm.cli.generate import generate
 from controlmm.cli.info import info
 from controlmm.cli.plot import plot
@@ -46,7 +47,7 @@ def _options(
     """Text plus 3D control in, human motion out."""
 
 
-for _command in (generate, info, prepare, train, plot, assemble):
+for _command in (generate, info, prepare, train, plot, assemble, convert):
     app.command()(_command)
 app.add_typer(controls_app, name="controls")
 
