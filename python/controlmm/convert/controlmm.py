@@ -21,7 +21,7 @@ from controlmm.motion.skeleton import Skeleton
 from controlmm.nn.checkpoint import PretrainedModel
 from controlmm.pipelines import folder as files
 from controlmm.pipelines.checks import check_sizes
-from controlmm.pipelines.controlmm import KIND
+from controlmm.pipelines.controlmm import ControlMM
 
 ControlKind = Literal["joints", "pelvis"]
 CLIP_DIM = 512  # ViT-B/32, which all published checkpoints were trained with
@@ -58,7 +58,7 @@ def convert(paths: Sequence[Path], out: Path, *, control: ControlKind | None = N
             network.save_pretrained(folder / name)
         normalizer.save(folder / files.NORMALIZER_FILE)
         files.write_json(folder / files.TEXT_ENCODER_FILE, {"kind": "clip", "dim": CLIP_DIM})
-        files.write_json(folder / files.PIPELINE_FILE, {"kind": KIND, "format": files.FORMAT})
+        files.write_json(folder / files.PIPELINE_FILE, {"kind": ControlMM.kind, "format": files.FORMAT})
     return report
 
 
