@@ -1,14 +1,13 @@
-"""Editing by gradient, against quadratic objectives with known minima and against the tiny decoder."""
+"""Logits editing and the control objective, against known minima and against the tiny decoder."""
 
 from __future__ import annotations
 
 import pytest
 import torch
 
-from controlmm.generation.editing import EditingBudget, edit_latents, edit_logits
+from controlmm.generation.editing import EditingBudget, edit_logits
 from controlmm.generation.objective import ControlObjective, control_error
 from controlmm.models.rvq_vae import frame_mask
-from controlmm.ops import masked_consistency_loss
 
 ROUNDING = 1e-5  # of float32 gradients through the decoder in another order
 
@@ -27,64 +26,6 @@ class Quadratic:
 
 def random(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
-
-
-@pytest.mark.parametrize("decays_rate", [True, False])
-def test_latents_reach_the_minimum_of_a_quadratic(decays_rate):
-    target = random(2, 3, 4)
-    edited, history = edit_latents(
-        torch.zeros(2, 3, 4),
-        Quadratic(target),
-        iterations=300,
-        decays_rate=decays_rate,
-        keep=torch.ones(2, 3, 1),
-    )
-    torch.testing.assert_close(edited, target, rtol=0, atol=0.02)
-    assert len(history) <= 301  # it stops when the distance is exactly 0
-    torch.testing.assert_close(history[0], target.square().sum((1, 2)))
-
-
-def test_every_clip_keeps_its_best_iterate():
-    class Scripted:
-        values = iter(torch.tensor([[5.0, 5.0], [1.0, 4.0], [9.0, 2.0], [7.0, 3.0]]))
-
-        def __init__(self):
-            self.seen = []
-
-        def value_and_gradient(self, latents):
-            self.seen.append(latents.detach().clone())
-            return next(self.values), torch.ones_like(latents)
-
-    objective = Scripted()
-    best, history = edit_latents(
-        random(2, 3, 4), objective, iterations=3, decays_rate=False, keep=torch.ones(2, 3, 1)
-    )
-    assert torch.equal(best[0], objective.seen[1][0])
-    assert torch.equal(best[1], objective.seen[2][1])
-    assert history.amin(0).tolist() == [1.0, 2.0]
-
-
-def test_no_iterations_judge_the_start_and_change_nothing():
-    start = random(1, 3, 4)
-    objective = Quadratic(torch.zeros(1, 3, 4))
-    edited, history = edit_latents(start, objective, iterations=0, decays_rate=True, keep=torch.ones(1, 3, 1))
-    assert torch.equal(edited, start)
-    assert (history.shape, objective.calls) == ((1, 1), 1)
-
-
-def test_editing_stops_when_the_target_is_met_exactly():
-    objective = Quadratic(torch.zeros(1, 3, 4))
-    edit_latents(torch.zeros(1, 3, 4), objective, iterations=50, decays_rate=True, keep=torch.ones(1, 3, 1))
-    assert objective.calls == 1
-
-
-def test_padding_is_not_edited():
-    keep = torch.tensor([[1.0], [1.0], [0.0]])[None]
-    edited, _ = edit_latents(
-        torch.zeros(1, 3, 4), Quadratic(torch.ones(1, 3, 4)), iterations=20, decays_rate=True, keep=keep
-    )
-    assert edited[0, 2].abs().max() == 0
-    assert edited[0, :2].min() > 0.5
 
 
 def test_logits_learn_to_choose_the_wanted_code():
@@ -159,6 +100,26 @@ def test_a_clips_objective_does_not_depend_on_the_clips_beside_it(scene):
     torch.testing.assert_close(gradient[1:, :4], other_gradient, rtol=1e-4, atol=ROUNDING)
 
 
+def test_selected_clips_have_the_objective_they_had_in_the_batch(scene):
+    decoder, targets, mask, frames = scene
+    latents = random(2, 6, 16)
+    objective = ControlObjective(decoder, targets, mask, frames)
+    value, gradient = objective.value_and_gradient(latents)
+    selected = objective.select(torch.tensor([1]))
+    other_value, other_gradient = selected.value_and_gradient(latents[1:])
+    torch.testing.assert_close(value[1:], other_value, rtol=ROUNDING, atol=ROUNDING)
+    torch.testing.assert_close(gradient[1:], other_gradient, rtol=1e-4, atol=ROUNDING)
+    assert torch.equal(selected.errors(), (3 * other_value).sqrt())
+
+
+def test_the_error_of_an_objective_bounds_the_mean_distance(scene):
+    decoder, targets, mask, frames = scene
+    latents = random(2, 6, 16)
+    objective = ControlObjective(decoder, targets, mask, frames)
+    objective.value_and_gradient(latents)
+    assert (objective.errors() >= control_error(decoder(latents, frames), targets, mask)).all()
+
+
 def test_repeated_evaluations_do_not_disturb_each_other(scene):
     decoder, targets, mask, frames = scene
     objective = ControlObjective(decoder, targets, mask, frames)
@@ -177,17 +138,6 @@ def test_control_error_is_the_distance_along_the_controlled_axes():
     targets[0, 1, 5] = torch.tensor([0.0, 3.0, 4.0])  # 5 m away
     targets[0, 3, 0] = torch.tensor([1.0, 99.0, 0.0])  # 1 m away, height free
     assert control_error(joints, targets, mask).tolist() == [3.0, 0.0]
-
-
-def test_latent_editing_lowers_the_error_of_the_decoded_motion(scene):
-    decoder, targets, mask, frames = scene
-    start = decoder.tokenizer.base_codes[:6].expand(2, 6, 16)
-    keep = frames[:, ::4, None].float()
-    objective = ControlObjective(decoder, targets, mask, frames)
-    edited, history = edit_latents(start * keep, objective, iterations=40, decays_rate=True, keep=keep)
-    final = masked_consistency_loss(decoder(edited, frames), targets, mask, norm="mse", reduction="clip")
-    assert (final < history[0]).all()
-    torch.testing.assert_close(final, history.amin(0), rtol=1e-4, atol=ROUNDING)
 
 
 def test_logits_editing_lowers_the_error_of_the_decoded_motion(scene):

@@ -1,8 +1,10 @@
-"""Editing by gradient: logits inside the decoding steps, latents at the end (ControlMM section 3.4)."""
+"""Logits editing inside the decoding steps (ControlMM section 3.4), and how much editing there is in all.
+
+Latents are edited at the end, by ``controlmm.generation.solvers``.
+"""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -11,10 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from controlmm.generation.objective import Objective
-
-Progress = Callable[[str, int, int], None]  # phase, steps done, steps in all
-
-_LOGITS_RATE, _BETAS, _WEIGHT_DECAY = 0.06, (0.5, 0.9), 1e-6
+from controlmm.generation.solvers.adamw import papers_optimizer
 
 
 @dataclass(frozen=True)
@@ -44,6 +43,8 @@ def edit_logits(
 ) -> Float[Tensor, "B L K"]:
     """Logits moved so that motions sampled from them meet the objective.
 
+    The noise differs from step to step, so that losses cannot be compared and the last iterate is returned.
+
     Args:
         logits: Base-layer logits.
         objective: What to minimise, on latents ``softmax(logits + noise) @ codes``.
@@ -53,7 +54,7 @@ def edit_logits(
         keep: 1 where a token belongs to a clip, 0 in padding.
     """
     edited = logits.detach().clone().requires_grad_()
-    optimizer = _optimizer(edited, _LOGITS_RATE)
+    optimizer = papers_optimizer(edited)
     for _ in range(iterations):
         with torch.enable_grad():
             latents = (torch.softmax(edited + noise(), dim=-1) @ codes) * keep
@@ -63,52 +64,3 @@ def edit_logits(
         (edited.grad,) = torch.autograd.grad(latents, edited, gradient)
         optimizer.step()
     return edited.detach()
-
-
-def edit_latents(
-    latents: Float[Tensor, "B L C"],
-    objective: Objective,
-    *,
-    iterations: int,
-    rate: float = 0.06,
-    decays_rate: bool,
-    keep: Float[Tensor, "B L 1"],
-    progress: Progress | None = None,
-) -> tuple[Float[Tensor, "B L C"], Float[Tensor, "I B"]]:
-    """Latents moved so that the decoded motion meets the objective; each clip keeps its best iterate.
-
-    Args:
-        latents: Where to start.
-        objective: What to minimise.
-        iterations: Gradient steps (AdamW).
-        rate: Learning rate; 0.06 is the papers', for their codes. It should go with the codes' spread.
-        decays_rate: Let the rate fall to zero along a cosine, which ends nearer the targets.
-        keep: 1 where a token belongs to a clip, 0 in padding.
-        progress: Called after every step.
-
-    Returns:
-        The latents, and the loss of every clip at every evaluation.
-    """
-    edited = latents.detach().clone().requires_grad_()
-    optimizer = _optimizer(edited, rate)
-    best, best_loss = latents.detach().clone(), torch.full((len(latents),), math.inf)
-    history = []
-    for step in range(iterations + 1):  # the last evaluation only judges the last step
-        loss, gradient = objective.value_and_gradient(edited)
-        history.append(loss)
-        better = loss < best_loss
-        best_loss = torch.where(better, loss, best_loss)
-        best = torch.where(better[:, None, None], edited.detach(), best)
-        if step == iterations or not loss.any():
-            break
-        if decays_rate:
-            optimizer.param_groups[0]["lr"] = rate * 0.5 * (1 + math.cos(math.pi * step / iterations))
-        edited.grad = gradient * keep
-        optimizer.step()
-        if progress is not None:
-            progress("codebook editing", step + 1, iterations)
-    return best, torch.stack(history)
-
-
-def _optimizer(variable: Tensor, rate: float) -> torch.optim.Optimizer:
-    return torch.optim.AdamW([variable], lr=rate, betas=_BETAS, weight_decay=_WEIGHT_DECAY)

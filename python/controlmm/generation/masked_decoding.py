@@ -11,10 +11,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from controlmm.generation.editing import Progress, edit_logits
+from controlmm.generation.editing import edit_logits
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.noise import ClipNoise
 from controlmm.generation.objective import ControlObjective
+from controlmm.generation.solvers import Progress
 from controlmm.models.control_branch import ControlBranch
 from controlmm.models.masked_transformer import MaskedTransformer
 from controlmm.models.residual_transformer import ResidualTransformer

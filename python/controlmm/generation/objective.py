@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from controlmm.generation.motion_decoder import MotionDecoder
@@ -19,6 +19,17 @@ class Objective(Protocol):
         self, latents: Float[Tensor, "B L C"]
     ) -> tuple[Float[Tensor, "B"], Float[Tensor, "B L C"]]:
         """Losses of the clips, and the gradient of their sum. No clip's numbers depend on another's."""
+
+    def select(self, clips: Int[Tensor, "S"]) -> Objective:
+        """The same for some of the clips, so that those that are done leave the batch."""
+
+
+@runtime_checkable
+class Measured(Protocol):
+    """An objective that knows how far the clips are from their targets."""
+
+    def errors(self) -> Float[Tensor, "B"]:
+        """Metres, at the latest evaluation."""
 
 
 class ControlObjective:
@@ -41,6 +52,7 @@ class ControlObjective:
         self.decoder = decoder
         self.targets, self.mask = frames_last(targets), frames_last(mask)
         self.frames = None if frames.all() else frames
+        self._loss = torch.zeros(len(targets))
         self._gradient: Tensor | None = None  # of the decoder's output, written again at every evaluation
 
     def value_and_gradient(
@@ -61,7 +73,21 @@ class ControlObjective:
             out=self._gradient,
         )
         (gradient,) = torch.autograd.grad(decoded, latents, self._gradient)
+        self._loss = loss
         return loss, gradient
+
+    def select(self, clips: Int[Tensor, "S"]) -> ControlObjective:
+        """See :class:`Objective`."""
+        frames = torch.ones(self.mask.shape[:2], dtype=torch.bool) if self.frames is None else self.frames
+        return ControlObjective(self.decoder, self.targets[clips], self.mask[clips], frames[clips])
+
+    def errors(self) -> Float[Tensor, "B"]:
+        """Root mean square distance of the controlled points in metres, at the latest evaluation.
+
+        It is never below their mean distance. Points with a free axis count as if their distance were larger
+        by at most the square root of 3.
+        """
+        return (3 * self._loss).sqrt()
 
 
 def control_error(

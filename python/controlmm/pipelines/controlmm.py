@@ -12,7 +12,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from controlmm.generation.editing import Progress, edit_latents
 from controlmm.generation.masked_decoding import (
     DecodingRequest,
     decode_from_text,
@@ -22,6 +21,7 @@ from controlmm.generation.masked_decoding import (
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.noise import ClipNoise
 from controlmm.generation.objective import ControlObjective
+from controlmm.generation.solvers import Progress, Stopping, adamw
 from controlmm.models.control_branch import ControlBranch
 from controlmm.models.masked_transformer import MaskedTransformer
 from controlmm.models.residual_transformer import ResidualTransformer
@@ -184,16 +184,15 @@ class ControlMM(MotionPipeline):
         ids[..., 0] = -1  # the base layer stays a soft mixture, only the residual layers are hard
         tokenizer = self.decoder.tokenizer
         latents = logits.softmax(-1) @ tokenizer.base_codes * keep + tokenizer.quantizer.lookup(ids)
-        edited, _ = edit_latents(
-            latents,
+        return adamw(
             objective,
-            iterations=preset.budget.latent_iterations,
+            latents,
+            keep,
+            Stopping(iterations=preset.budget.latent_iterations),
             rate=preset.budget.latent_rate * tokenizer.base_codes.std().item(),
             decays_rate=preset.budget.decays_rate,
-            keep=keep,
             progress=request.progress,
-        )
-        return edited
+        ).latents
 
 
 def _padded(dense: Tensor, frames: int) -> Tensor:

@@ -14,9 +14,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controlmm.controls import Control
-from controlmm.generation.editing import Progress
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.noise import clip_seeds
+from controlmm.generation.solvers import Progress
 from controlmm.motion.skeleton import Skeleton
 from controlmm.nn.checkpoint import PretrainedModel
 from controlmm.pipelines import folder as files

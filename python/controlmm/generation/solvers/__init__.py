@@ -1,0 +1,8 @@
+"""Solvers of editing: an objective and latents in, better latents out."""
+
+from controlmm.generation.solvers.adamw import adamw
+from controlmm.generation.solvers.clip_search import Progress
+from controlmm.generation.solvers.lbfgs import LbfgsTolerance, lbfgs
+from controlmm.generation.solvers.stopping import Reason, Solution, Stopping
+
+__all__ = ["LbfgsTolerance", "Progress", "Reason", "Solution", "Stopping", "adamw", "lbfgs"]
