@@ -105,10 +105,16 @@ def test_a_clip_without_features_is_named(walk, tmp_path):
 @pytest.mark.parametrize(
     ("line", "caption"),
     [
-        ("a person walks.#a/DET person/NOUN walk/VERB#0.0#0.0", Caption("a person walks.")),
-        ("he turns#he/PRON turn/VERB#2.5#4.0", Caption("he turns", start=2.5, end=4.0)),
-        ("he turns#he/PRON turn/VERB#nan#nan", Caption("he turns")),
-        ("he turns#he/PRON turn/VERB", Caption("he turns")),
+        (
+            "a person walks.#a/DET person/NOUN walk/VERB#0.0#0.0",
+            Caption("a person walks.", tokens=("a/DET", "person/NOUN", "walk/VERB")),
+        ),
+        (
+            "he turns#he/PRON turn/VERB#2.5#4.0",
+            Caption("he turns", start=2.5, end=4.0, tokens=("he/PRON", "turn/VERB")),
+        ),
+        ("he turns#he/PRON turn/VERB#nan#nan", Caption("he turns", tokens=("he/PRON", "turn/VERB"))),
+        ("he turns#he/PRON turn/VERB", Caption("he turns", tokens=("he/PRON", "turn/VERB"))),
         ("he turns", Caption("he turns")),
         ("he turns##x#1", Caption("he turns", start=0.0, end=1.0)),
     ],

@@ -107,7 +107,7 @@ def test_a_folder_of_joint_files_is_read_with_captions_and_splits(walk, tmp_path
     (tmp_path / "val.txt").write_text("b\n", encoding="utf-8")
     first, second = read_joint_folder(tmp_path)
     assert torch.equal(first.joints, walk(9))
-    assert first.captions == (Caption("walks"), Caption("stops", start=1.0, end=2.0))
+    assert first.captions == (Caption("walks"), Caption("stops", start=1.0, end=2.0, tokens=("stop/VERB",)))
     assert (first.split, second.split, second.captions) == ("train", "val", ())
 
 

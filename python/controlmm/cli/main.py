@@ -14,6 +14,7 @@ from typer.core import TyperGroup
 from controlmm.cli.assemble import assemble
 from controlmm.cli.controls import controls_app
 from controlmm.cli.convert import convert
+from controlmm.cli.convert_evaluator import convert_evaluator
 from controlmm.cli.generate import generate
 from controlmm.cli.info import info
 from controlmm.cli.plot import plot
@@ -47,7 +48,7 @@ def _options(
     """Text plus 3D control in, human motion out."""
 
 
-for _command in (generate, info, prepare, train, plot, assemble, convert):
+for _command in (generate, info, prepare, train, plot, assemble, convert, convert_evaluator):
     app.command()(_command)
 app.add_typer(controls_app, name="controls")
 

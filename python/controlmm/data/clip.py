@@ -19,6 +19,9 @@ class Caption:
     kind: str = "annotator"  # who wrote it: annotator, description, template, written, kinematic
     start: float = 0.0  # seconds; start = end = 0 means the whole clip
     end: float = 0.0
+    tokens: tuple[
+        str, ...
+    ] = ()  # ``word/TAG``, where the data set has them; the published evaluator needs them
 
     @property
     def is_partial(self) -> bool:
@@ -36,7 +39,8 @@ def parse_caption(line: str, kind: str = "annotator") -> Caption:
         except ValueError:
             times.append(0.0)
     start, end = times if len(times) == 2 and all(map(math.isfinite, times)) else (0.0, 0.0)
-    return Caption(text.strip(), kind, start, end)
+    tokens = tuple(rest[0].split()) if rest else ()
+    return Caption(text.strip(), kind, start, end, tokens)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from controlmm.nn.checkpoint import read_weights
 
 MAX_WORDS = 20
 _POSITIONS = MAX_WORDS + 2  # with start and end mark
-_WORDS_FILE, _VECTORS_FILE = "words.txt", "words.safetensors"
+WORDS_FILE, _VECTORS_FILE = "words.txt", "words.safetensors"
 _TAGS = (
     "VERB", "NOUN", "DET", "ADP", "NUM", "AUX", "PRON", "ADJ", "ADV", "Loc_VIP", "Body_VIP", "Obj_VIP",
     "Act_VIP", "Desc_VIP", "OTHER",
@@ -76,15 +76,15 @@ class WordVectors:
             FileNotFoundError: If a file is missing.
             ValueError: If one is damaged.
         """
-        listing = Path(folder) / _WORDS_FILE
+        listing = Path(folder) / WORDS_FILE
         if not listing.is_file():
-            raise FileNotFoundError(f"No {_WORDS_FILE} in {folder}.")
+            raise FileNotFoundError(f"No {WORDS_FILE} in {folder}.")
         vectors = read_weights(Path(folder) / _VECTORS_FILE)["vectors"]
         return cls(listing.read_text(encoding="utf-8").splitlines(), vectors)
 
     def save(self, folder: str | Path) -> None:
         """Write ``words.txt`` (a word a line) and ``words.safetensors`` into ``folder``."""
-        (Path(folder) / _WORDS_FILE).write_text("\n".join(self._words) + "\n", encoding="utf-8")
+        (Path(folder) / WORDS_FILE).write_text("\n".join(self._words) + "\n", encoding="utf-8")
         save_file({"vectors": self._vectors.contiguous()}, Path(folder) / _VECTORS_FILE)
 
     def encode(self, sentences: Sequence[Sequence[str]]) -> Sentences:
