@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -125,6 +126,33 @@ def test_other_settings_do_not_resume_a_run(root: Path, data: Path, refused: Com
         "train", "rvq", "--data", data, "--config", "tiny", "--out", root, "--seed", 9, "--quiet"
     )
     assert "holds a run with another settings" in message
+
+
+def test_options_of_a_stage_are_set_by_name(root: Path, data: Path, command: Command, tmp_path: Path) -> None:
+    shutil.copytree(root, tmp_path / "root", ignore=shutil.ignore_patterns("control"))
+    arguments = ("--data", data, "--config", "tiny", "--text", "hashing", "--out", tmp_path / "root")
+    options = ("--set", "masks=cross", "--set", "sampling=gumbel_st", "--set", "into_frozen_trunk=false")
+    command("train", "control", *arguments, *options, "--steps", 2, "--batch-size", 2, "--quiet")
+    told = json.loads((tmp_path / "root" / "control" / "run.json").read_text())
+    assert told["options"] == {"masks": "cross", "sampling": "gumbel_st", "into_frozen_trunk": "false"}
+    assert told["alpha"] == 0.5  # the published one for such masks
+    config = json.loads((tmp_path / "root" / "control" / "best" / "config.json").read_text())
+    assert config["into_frozen_trunk"] is False
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("masks", "`--set` expects NAME=VALUE, got 'masks'"),
+        ("masks=all", "Option 'masks' must be one of mixed, trajectory, random, cross, got 'all'"),
+        ("colour=red", "There is no option 'colour'. Options: alpha, "),
+    ],
+)
+def test_unknown_options_are_refused(
+    root: Path, data: Path, refused: Command, tmp_path: Path, option: str, message: str
+) -> None:
+    arguments = ("--data", data, "--config", "tiny", "--text", "hashing", "--out", tmp_path)
+    assert message in refused("train", "control", *arguments, "--set", option, "--quiet")
 
 
 def test_all_stages_must_have_the_same_text_encoder(root: Path, data: Path, refused: Command) -> None:

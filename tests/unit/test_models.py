@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -273,9 +275,43 @@ def test_text_is_dropped_clip_by_clip():
         (RvqVaeConfig, {"quantize_dropout": 1.5}, r"`quantize_dropout` must be in \[0, 1\]"),
         (MaskedTransformerConfig, {"heads": 5}, "`width` must be a multiple of `heads`, got 384 and 5"),
         (ResidualTransformerConfig, {"num_quantizers": 2}, "`num_quantizers` must be at least 3"),
+        (ControlBranchConfig, {"encoder": "mlp"}, r"`encoder` must be one of .*, got 'mlp'"),
         (ControlBranchConfig, {"joints": ()}, "`joints` must name at least one joint"),
     ],
 )
 def test_impossible_configurations_are_refused(config, changes, message):
     with pytest.raises(ValueError, match=message):
         config(**changes)
+
+
+def test_a_projection_maps_the_frames_of_each_token_alone():
+    """The paper's "projection layer": no token hears of its neighbours, as in the convolutions it does."""
+    for kind, hears in (("projection", False), ("convolution", True)):
+        torch.manual_seed(0)
+        branch = ControlBranch(replace(ControlBranchConfig.tiny(), encoder=kind)).eval()
+        signal = torch.randn(1, branch.config.signal_dim, 12, generator=torch.Generator().manual_seed(1))
+        moved = signal.clone()
+        moved[:, :, 4:8] += 1
+        difference = (branch.encoder(moved) - branch.encoder(signal)).abs().amax((0, 1))
+        assert difference[1] > 0
+        assert (difference[[0, 2]].max() > 0) == hears
+
+
+def test_a_projected_signal_is_silent_in_padding():
+    branch = ControlBranch(replace(ControlBranchConfig.tiny(), encoder="projection")).eval()
+    frames = frame_mask(torch.tensor([8]), 12)
+    assert branch.encoder(torch.zeros(1, branch.config.signal_dim, 12), frames)[..., 2].abs().max() == 0
+
+
+@pytest.mark.parametrize("into_frozen_trunk", [True, False])
+def test_the_hint_enters_the_frozen_trunk_only_if_it_should(masked, into_frozen_trunk):
+    """With silent middle linears the hint can reach the logits by no other way."""
+    config = replace(ControlBranchConfig.tiny(), into_frozen_trunk=into_frozen_trunk)
+    branch = ControlBranch.beside(masked, config).eval()
+    torch.nn.init.normal_(branch.first_zero.weight, generator=torch.Generator().manual_seed(0))
+    ids = torch.zeros(1, 3, dtype=torch.long)
+    valid = torch.ones(1, 3, dtype=torch.bool)
+    sequence = masked.sequence(masked.embed(ids), torch.ones(1, 64))
+    signal = torch.randn(1, 12, config.signal_dim, generator=torch.Generator().manual_seed(1))
+    changed = not torch.equal(branch(masked, sequence, signal, valid), masked.logits(sequence, valid))
+    assert changed == into_frozen_trunk

@@ -44,6 +44,14 @@ def train(
     batch_size: Annotated[int | None, typer.Option(help="Clips a step.", show_default=False)] = None,
     learning_rate: Annotated[float | None, typer.Option(help="Peak rate.", show_default=False)] = None,
     seed: Annotated[int | None, typer.Option(help="Weights and batches.", show_default=False)] = None,
+    options: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="Change an option of the stage or its network, such as masks=cross; may be repeated.",
+        ),
+    ] = None,
     threads: Annotated[
         int | None, typer.Option(help="Threads of torch; by default all.", min=1, show_default=False)
     ] = None,
@@ -58,6 +66,7 @@ def train(
 
     if threads is not None:
         torch.set_num_threads(threads)
+    named = dict(map(_name_and_value, options or []))
     MotionFolder(data)  # before anything is written: a missing folder leaves no trace of a run
     given = {"steps": steps, "batch_size": batch_size, "learning_rate": learning_rate, "seed": seed}
     changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
@@ -72,6 +81,7 @@ def train(
                 root=out,
                 text_encoder=encoder,
                 changes=changes,
+                options=named,
                 start_from=start_from,
                 progress=not quiet,
             )
@@ -81,6 +91,13 @@ def train(
         )
         raise typer.Exit(_INTERRUPTED) from None
     typer.echo(f"{run}: done, best weights in {run / 'best'}; see its curves with: controlmm plot {run}")
+
+
+def _name_and_value(option: str) -> tuple[str, str]:
+    name, equals, value = option.partition("=")
+    if not equals or not name:
+        raise ValueError(f"`--set` expects NAME=VALUE, got {option!r}.")
+    return name, value
 
 
 def _load_encoder(kind: str, folder: Path | None, root: Path) -> TextEncoder:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, Literal, get_args
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,6 +15,8 @@ from controlmm.motion.skeleton import Skeleton
 from controlmm.nn.checkpoint import PretrainedModel
 from controlmm.nn.conv import ConvEncoder
 from controlmm.nn.trunk import encoder_layers
+
+_EncoderKind = Literal["convolution", "projection"]
 
 
 @dataclass(frozen=True)
@@ -32,10 +34,14 @@ class ControlBranchConfig:
     encoder_depth: int = 3
     downsample: int = 4
     into_frozen_trunk: bool = True  # published code; the paper's figure feeds only the copy
+    encoder: _EncoderKind = "convolution"  # published code; the paper's words
+    signal_scale: float = 1.0  # metres for each unit of the skeleton: 0.001 for KIT-ML
 
     def __post_init__(self) -> None:
         if self.width % self.heads:
             raise ValueError(f"`width` must be a multiple of `heads`, got {self.width} and {self.heads}.")
+        if self.encoder not in get_args(_EncoderKind):
+            raise ValueError(f"`encoder` must be one of {get_args(_EncoderKind)}, got {self.encoder!r}.")
         if not self.joints:
             raise ValueError("`joints` must name at least one joint.")
 
@@ -73,9 +79,8 @@ class ControlBranchConfig:
     def for_skeleton(self, skeleton: Skeleton) -> ControlBranchConfig:
         """The same sizes for another skeleton: all of its joints, or its six control joints."""
         names_all = len(self.joints) > len(skeleton.control_joints)
-        return replace(
-            self, joints=tuple(range(skeleton.num_joints)) if names_all else skeleton.control_joints
-        )
+        joints = tuple(range(skeleton.num_joints)) if names_all else skeleton.control_joints
+        return replace(self, joints=joints, signal_scale=skeleton.metres)
 
     def check_base(self, base: MaskedTransformerConfig) -> None:
         """Raise ``ValueError`` unless the branch fits the masked transformer."""
@@ -96,14 +101,7 @@ class ControlBranch(PretrainedModel):
 
     def __init__(self, config: ControlBranchConfig) -> None:
         super().__init__(config)
-        self.encoder = ConvEncoder(
-            config.signal_dim,
-            config.width,
-            width=config.encoder_width,
-            depth=config.encoder_depth,
-            downsample=config.downsample,
-            dropout=config.dropout,
-        )
+        self.encoder = _signal_encoder(config)
         self.first_zero = _zero_linear(config.width)
         self.layers = encoder_layers(
             config.layers,
@@ -135,14 +133,15 @@ class ControlBranch(PretrainedModel):
         """The control signal: masked (target - current), masked target, and the mask; joint-major, metres.
 
         Args:
-            targets: Global positions to reach.
+            targets: Global positions to reach, in the skeleton's unit.
             mask: Which coordinates are controlled.
             current: Positions of the motion decoded from the present tokens.
         """
         joints = list(self.config.joints)
         observed = mask[:, :, joints].to(current.dtype)
-        difference = torch.where(mask, targets - current, 0.0)[:, :, joints]
-        target = torch.where(mask, targets, 0.0)[:, :, joints]
+        scale = self.config.signal_scale
+        difference = torch.where(mask, targets - current, 0.0)[:, :, joints] * scale
+        target = torch.where(mask, targets, 0.0)[:, :, joints] * scale
         parts = [difference, target, observed] if self.config.has_observation_mask else [difference, target]
         return torch.cat([part.flatten(2) for part in parts], dim=-1)
 
@@ -165,6 +164,34 @@ class ControlBranch(PretrainedModel):
             residuals.append(zero(hidden))
         start = sequence + hint if self.config.into_frozen_trunk else sequence
         return base.logits(start, valid, residuals)
+
+
+class SignalProjection(nn.Module):
+    """One linear map from the frames of a token to the token: the paper's "projection layer"."""
+
+    def __init__(self, in_dim: int, out_dim: int, *, downsample: int) -> None:
+        super().__init__()
+        self.linear = nn.Conv1d(in_dim, out_dim, downsample, stride=downsample)
+
+    def forward(
+        self, x: Float[Tensor, "B D T"], valid: Bool[Tensor, "B T"] | None = None
+    ) -> Float[Tensor, "B C L"]:
+        """As :meth:`ConvEncoder.forward`."""
+        projected: Tensor = self.linear(x)
+        return projected if valid is None else projected * valid[:, None, :: self.linear.stride[0]]
+
+
+def _signal_encoder(config: ControlBranchConfig) -> nn.Module:
+    if config.encoder == "projection":
+        return SignalProjection(config.signal_dim, config.width, downsample=config.downsample)
+    return ConvEncoder(
+        config.signal_dim,
+        config.width,
+        width=config.encoder_width,
+        depth=config.encoder_depth,
+        downsample=config.downsample,
+        dropout=config.dropout,
+    )
 
 
 def _zero_linear(width: int) -> nn.Linear:

@@ -30,6 +30,9 @@ class RvqVaeConfig:
     shared_codebook: bool = False
     quantize_dropout: float = 0.2  # share of training batches that use a random number of layers
     sample_temperature: float = 0.5  # of the random code choice in training
+    takes_first_rows: bool = (
+        False  # fresh and dead codes: first vectors of the batch (published), or random ones
+    )
 
     def __post_init__(self) -> None:
         if self.downsample < 2 or self.downsample & (self.downsample - 1):
@@ -79,6 +82,7 @@ class RvqVae(PretrainedModel):
             shared=config.shared_codebook,
             temperature=config.sample_temperature,
             dropout=config.quantize_dropout,
+            takes_first_rows=config.takes_first_rows,
         )
 
     def forward(

@@ -48,6 +48,11 @@ class Skeleton:
         return 12 * self.num_joints - 1
 
     @property
+    def metres(self) -> float:
+        """Length of one ``unit`` in metres."""
+        return 0.001 if self.unit == "mm" else 1.0
+
+    @property
     def foot_joints(self) -> tuple[int, int, int, int]:
         """The joints of the four contact channels, in channel order."""
         return (*self.left_foot, *self.right_foot)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import cast
 
@@ -30,9 +31,10 @@ class EmaCodebook(nn.Module):
     ema_count: Tensor
     is_initialized: Tensor
 
-    def __init__(self, num_codes: int, dim: int, *, decay: float) -> None:
+    def __init__(self, num_codes: int, dim: int, *, decay: float, takes_first_rows: bool = False) -> None:
         super().__init__()
         self.decay = decay
+        self._rows: Callable[[Tensor, int], Tensor] = _first_rows if takes_first_rows else _random_rows
         self.register_buffer("codes", torch.zeros(num_codes, dim))
         self.register_buffer("ema_sum", torch.zeros(num_codes, dim))
         self.register_buffer("ema_count", torch.ones(num_codes))
@@ -51,7 +53,7 @@ class EmaCodebook(nn.Module):
 
     @torch.no_grad()
     def update(self, x: Float[Tensor, "N C"], ids: Int[Tensor, "N"]) -> None:
-        """Move the codes towards the vectors that chose them; dead ones become random rows of ``x``."""
+        """Move the codes towards the vectors that chose them; dead ones become rows of ``x``."""
         num_codes = len(self.codes)
         count = torch.bincount(ids, minlength=num_codes).to(x.dtype)
         total = torch.zeros_like(self.codes).index_add_(0, ids, x)
@@ -59,12 +61,12 @@ class EmaCodebook(nn.Module):
         self.ema_count.lerp_(count, 1 - self.decay)
         alive = (self.ema_count >= _RESET_BELOW)[:, None]
         means = self.ema_sum / self.ema_count.clamp(min=_RESET_BELOW)[:, None]
-        self.codes.copy_(torch.where(alive, means, _random_rows(x, num_codes)))
+        self.codes.copy_(torch.where(alive, means, self._rows(x, num_codes)))
 
     @torch.no_grad()
     def initialize(self, x: Float[Tensor, "N C"]) -> None:
         """Start from vectors of the first batch."""
-        self.codes.copy_(_random_rows(x, len(self.codes)))
+        self.codes.copy_(self._rows(x, len(self.codes)))
         self.ema_sum.copy_(self.codes)
         self.ema_count.fill_(1.0)
         self.is_initialized.fill_(True)
@@ -83,12 +85,15 @@ class ResidualQuantizer(nn.Module):
         shared: bool,
         temperature: float,
         dropout: float,
+        takes_first_rows: bool = False,
     ) -> None:
         super().__init__()
         self.num_quantizers, self.temperature, self.dropout = num_quantizers, temperature, dropout
         self.is_shared = shared
         books = 1 if shared else num_quantizers
-        self.books = nn.ModuleList(EmaCodebook(num_codes, dim, decay=decay) for _ in range(books))
+        self.books = nn.ModuleList(
+            EmaCodebook(num_codes, dim, decay=decay, takes_first_rows=takes_first_rows) for _ in range(books)
+        )
 
     def book(self, layer: int) -> EmaCodebook:
         """The codebook of a layer (the only one when they are shared)."""
@@ -148,10 +153,21 @@ class ResidualQuantizer(nn.Module):
 
 def _random_rows(x: Float[Tensor, "N C"], count: int) -> Float[Tensor, "K C"]:
     """``count`` rows of ``x`` in random order; fewer rows are repeated with a little noise."""
-    if len(x) < count:
-        x = x.repeat((count + len(x) - 1) // len(x), 1)
-        x = x + torch.randn_like(x) * 0.01 / x.shape[1] ** 0.5
+    x = _at_least(x, count)
     return x[torch.randperm(len(x))[:count]]
+
+
+def _first_rows(x: Float[Tensor, "N C"], count: int) -> Float[Tensor, "K C"]:
+    """The first ``count`` rows, as the published training takes them."""
+    return _at_least(x, count)[:count]
+
+
+def _at_least(x: Float[Tensor, "N C"], count: int) -> Float[Tensor, "N C"]:
+    if len(x) >= count:
+        return x
+    x = x.repeat((count + len(x) - 1) // len(x), 1)
+    noisy: Tensor = x + torch.randn_like(x) * 0.01 / x.shape[1] ** 0.5
+    return noisy
 
 
 def _perplexity(ids: Int[Tensor, "N"], num_codes: int) -> Float[Tensor, ""]:

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
+
+MaskMode = Literal["mixed", "trajectory", "random", "cross"]
+
+_LONGEST = 196  # frames; the published modes draw the number of controlled ones up to it, whatever the clip's
 
 # Shares of the kinds of control in training. The published modes are `trajectory` and `cross` with a uniform
 # density; ours is heavy on sparse targets, which people give, and keeps a share without any control.
@@ -42,6 +47,30 @@ def mixed_masks(
     return masks
 
 
+def sample_masks(
+    mode: MaskMode, frames: Bool[Tensor, "B T"], *, joints: int, among: Sequence[int]
+) -> Bool[Tensor, "B T J 3"]:
+    """Random control masks of a named kind.
+
+    ``trajectory``, ``random`` and ``cross`` are the published ones: the root at a uniform number of frames,
+    one joint a clip likewise, a uniform number of (frame, joint) pairs. ``mixed`` is ours: all joints, ground
+    paths and whole poses too, sparse more often than dense.
+
+    Args:
+        mode: Which kind.
+        frames: Frames of each clip.
+        joints: Joints of the skeleton.
+        among: The six joints of the papers.
+    """
+    if mode == "trajectory":
+        return trajectory_masks(frames, joints=joints)
+    if mode == "random":
+        return random_masks(frames, joints=joints, among=among)
+    if mode == "cross":
+        return cross_masks(frames, joints=joints, among=among)
+    return mixed_masks(frames, joints=joints, favoured=among)
+
+
 def random_frames(length: int) -> Int[Tensor, "N"]:
     """Between 1 and ``length`` distinct frames; their number is log-uniform: sparse control is common."""
     count = int(torch.exp(torch.rand(()) * torch.tensor(float(length) + 1).log()))
@@ -50,10 +79,24 @@ def random_frames(length: int) -> Int[Tensor, "N"]:
 
 def trajectory_masks(frames: Bool[Tensor, "B T"], *, joints: int) -> Bool[Tensor, "B T J 3"]:
     """Published mode ``trajectory``: the pelvis at a uniform number of frames."""
+    return _one_joint_masks(frames, joints=joints, among=(0,))
+
+
+def random_masks(
+    frames: Bool[Tensor, "B T"], *, joints: int, among: Sequence[int]
+) -> Bool[Tensor, "B T J 3"]:
+    """Published mode ``random``: one joint of ``among`` a clip, at a uniform number of frames."""
+    return _one_joint_masks(frames, joints=joints, among=among)
+
+
+def _one_joint_masks(
+    frames: Bool[Tensor, "B T"], *, joints: int, among: Sequence[int]
+) -> Bool[Tensor, "B T J 3"]:
     masks = torch.zeros(*frames.shape, joints, 3, dtype=torch.bool)
     for mask, length in zip(masks, frames.sum(1).tolist(), strict=True):
-        count = max(1, round(torch.rand(()).item() * 196))
-        mask[torch.randperm(length)[: min(count, length)], 0] = True
+        count = max(1, round(torch.rand(()).item() * _LONGEST))
+        joint = among[int(torch.randint(len(among), ()))]
+        mask[torch.randperm(length)[: min(count, length)], joint] = True
     return masks
 
 

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import smooth_l1_loss
+from torch.nn.functional import l1_loss, smooth_l1_loss
 
 from controlmm.data.clip import FeatureClip
 from controlmm.models.rvq_vae import RvqVae, RvqVaeConfig
 from controlmm.motion.layout import feature_layout
-from controlmm.motion.normalizer import Normalizer
+from controlmm.motion.normalizer import ROOT_CONTACT_BIAS, Normalizer
 from controlmm.ops import recover_joints
 from controlmm.training.loop import Recipe
 from controlmm.training.settings import TrainingSettings
@@ -41,12 +42,26 @@ SETTINGS = {
 }
 
 
-class RvqRecipe:
-    """Smooth-L1 reconstruction, a second time on joint positions, commitment, and global joints in metres.
+@dataclass(frozen=True)
+class RvqOptions:
+    """What the tokenizer's recipe can do in different ways."""
 
-    The last term is ours (weight 0 gives the published loss): errors of the root velocity add up along the
-    path, and only the recovered joints show it.
-    """
+    # Weight of the recovered joints' error in metres, which is ours: errors of the root velocity add up along
+    # the path, and only those joints show it. 0 gives the published loss.
+    joint_weight: float = 1.0
+    reconstruction: Literal["smooth_l1", "l1"] = "smooth_l1"
+    root_contact_bias: float = ROOT_CONTACT_BIAS  # published option: 5, but applied twice, so 25
+
+    def __post_init__(self) -> None:
+        if not self.joint_weight >= 0 or not self.root_contact_bias > 0:
+            raise ValueError(
+                "`joint_weight` must not be negative and `root_contact_bias` must be positive, got "
+                f"{self.joint_weight} and {self.root_contact_bias}."
+            )
+
+
+class RvqRecipe:
+    """Reconstruction, a second time on joint positions, commitment, and global joints in metres."""
 
     def __init__(
         self,
@@ -55,11 +70,12 @@ class RvqRecipe:
         train_clips: Sequence[FeatureClip],
         val_clips: Sequence[FeatureClip],
         *,
-        joint_weight: float = 1.0,
+        options: RvqOptions = RvqOptions(),
     ) -> None:
         self.model = RvqVae(config)
         self.normalizer = normalizer
-        self.joint_weight = joint_weight
+        self.joint_weight = options.joint_weight
+        self._distance = smooth_l1_loss if options.reconstruction == "smooth_l1" else l1_loss
         self._windows = WindowSampler(train_clips, normalizer, length=WINDOW)
         self._val_clips = [clip for clip in val_clips if len(clip.features) >= config.downsample]
         if not self._val_clips:
@@ -71,8 +87,8 @@ class RvqRecipe:
         target = self._windows.sample(batch_size)
         decoded, quantized = self.model(target)
         decoded = decoded.float()
-        reconstruction = smooth_l1_loss(decoded, target)
-        positions = smooth_l1_loss(decoded[..., self._positions], target[..., self._positions])
+        reconstruction = self._distance(decoded, target)
+        positions = self._distance(decoded[..., self._positions], target[..., self._positions])
         loss = reconstruction + POSITION_WEIGHT * positions + _COMMITMENT_WEIGHT * quantized.commitment
         losses = {
             "reconstruction": reconstruction,
@@ -143,11 +159,14 @@ def layer_perplexities(ids: Int[Tensor, "N Q"]) -> dict[str, float]:
 def _build(config: RvqVaeConfig, inputs: StageInputs) -> Recipe:
     if not inputs.train_clips:
         raise ValueError("The training split has no readable clip.")
-    normalizer = Normalizer.fit(clip.features for clip in inputs.train_clips)
+    options: RvqOptions = inputs.options
+    normalizer = Normalizer.fit(
+        (clip.features for clip in inputs.train_clips), root_contact_bias=options.root_contact_bias
+    )
     inputs.root.mkdir(parents=True, exist_ok=True)
     normalizer.save(inputs.root / NORMALIZER_FILE)
     config = config.for_features(normalizer.skeleton.feature_dim)
-    return RvqRecipe(config, normalizer, inputs.train_clips, inputs.val_clips)
+    return RvqRecipe(config, normalizer, inputs.train_clips, inputs.val_clips, options=options)
 
 
 STAGE = Stage(
@@ -157,5 +176,6 @@ STAGE = Stage(
     SETTINGS,
     network="tokenizer",
     uses_text=False,
+    options=RvqOptions(),
     starts_from_weights=False,
 )

@@ -34,6 +34,7 @@ class StageInputs:
     train_clips: Sequence[FeatureClip]
     val_clips: Sequence[FeatureClip]
     text_encoder: TextEncoder | None = None  # set for stages that use text
+    options: Any = None  # the stage's own, see `Stage.options`
     progress: bool = True
 
     def text_features(self) -> dict[str, Float[Tensor, "E"]]:
@@ -72,6 +73,7 @@ class Stage:
     needs: tuple[str, ...] = ()  # stages that must be trained before, in the same root
     network: str | None = field(default=None, kw_only=True)  # its folder in the folder of a whole model
     uses_text: bool = field(default=True, kw_only=True)
+    options: Any = field(default=None, kw_only=True)  # a frozen dataclass: the recipe's own, with defaults
     starts_from_weights: bool = field(default=True, kw_only=True)  # whether a model's weights are enough
 
 

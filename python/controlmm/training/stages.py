@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from controlmm.data.clip import FeatureClip
 from controlmm.data.folder import MotionFolder
 from controlmm.nn.checkpoint import CONFIG_FILE, WEIGHTS_FILE, read_config
 from controlmm.text import TextEncoder
+from controlmm.training.changes import with_changes
 from controlmm.training.loop import Recipe, train
 from controlmm.training.registry import load_stage
 from controlmm.training.stage import Stage, StageInputs, best_weights
@@ -28,6 +29,7 @@ def train_stage(
     root: str | Path,
     text_encoder: TextEncoder | None = None,
     changes: dict[str, Any] | None = None,
+    options: Mapping[str, str] | None = None,
     start_from: str | Path | None = None,
     progress: bool = True,
 ) -> Path:
@@ -40,6 +42,8 @@ def train_stage(
         root: Folder of all stages of one model.
         text_encoder: Needed by stages that use text; its features are cached beside the data.
         changes: Fields of :class:`TrainingSettings` to override.
+        options: Fields of the network's configuration or of the stage's own options to change, written as on
+            the command line: ``{"masks": "cross"}``.
         start_from: Train given weights further: a network's folder, or the folder of a whole model, which
             also lends the earlier stages that ``root`` lacks (they are copied there). The network keeps its
             configuration; ``size`` then only names the settings.
@@ -58,6 +62,8 @@ def train_stage(
         start = starting_folder(Path(start_from), stage)
         adopt_earlier_stages(Path(start_from), root, stage)
         config = read_config(start / CONFIG_FILE, type(config))
+    parts = with_changes({"config": config, "options": stage.options}, options or {})
+    config = parts["config"]
     for need in stage.needs:
         best_weights(root, need)
     if stage.uses_text and text_encoder is None:
@@ -68,13 +74,14 @@ def train_stage(
         train_clips=list(folder.clips("train", progress=progress)),
         val_clips=list(folder.clips("val", progress=progress)),
         text_encoder=text_encoder,
+        options=parts["options"],
         progress=progress,
     )
     torch.manual_seed(settings.seed)  # fresh weights are a function of the seed
     recipe = stage.build(config, inputs)
     if start is not None:
         load_starting_weights(recipe.model, start)
-    train(_Described(recipe, size, inputs, start), settings, root / name, progress=progress)
+    train(_Described(recipe, size, inputs, start, options or {}), settings, root / name, progress=progress)
     return root / name
 
 
@@ -87,9 +94,12 @@ def _of_size(stage: Stage, size: str) -> tuple[Any, Any]:
 class _Described:
     """A recipe that also says which clips it was given, so that a run names its data."""
 
-    def __init__(self, recipe: Recipe, size: str, inputs: StageInputs, start: Path | None) -> None:
+    def __init__(
+        self, recipe: Recipe, size: str, inputs: StageInputs, start: Path | None, options: Mapping[str, str]
+    ) -> None:
         self._recipe, self._size = recipe, size
         self._start = {} if start is None else {"start_from_sha256": _file_hash(start / WEIGHTS_FILE)}
+        self._options = {"options": dict(options)} if options else {}
         self._data = {
             name: {"clips": len(clips), "sha256": _hash(clips)}
             for name, clips in (("train", inputs.train_clips), ("val", inputs.val_clips))
@@ -97,7 +107,13 @@ class _Described:
         self.model, self.loss, self.validate = recipe.model, recipe.loss, recipe.validate
 
     def describe(self) -> dict[str, Any]:
-        return {**self._recipe.describe(), "size": self._size, **self._start, "data": self._data}
+        return {
+            **self._recipe.describe(),
+            "size": self._size,
+            **self._options,
+            **self._start,
+            "data": self._data,
+        }
 
 
 def _file_hash(path: Path) -> str:
