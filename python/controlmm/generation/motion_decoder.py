@@ -5,7 +5,7 @@ from __future__ import annotations
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from controlmm.models.rvq_vae import RvqVae
+from controlmm.models.tokenizer import MotionTokenizer
 from controlmm.motion.normalizer import Normalizer
 from controlmm.ops import recover_joints
 
@@ -17,7 +17,7 @@ class MotionDecoder(nn.Module):
     clip's motion does not depend on the padding of its batch.
     """
 
-    def __init__(self, tokenizer: RvqVae, normalizer: Normalizer) -> None:
+    def __init__(self, tokenizer: MotionTokenizer, normalizer: Normalizer) -> None:
         super().__init__()
         self.tokenizer = tokenizer.eval().requires_grad_(False)
         self.normalizer = normalizer
@@ -25,7 +25,7 @@ class MotionDecoder(nn.Module):
     @property
     def downsample(self) -> int:
         """Frames for each token."""
-        return self.tokenizer.config.downsample
+        return self.tokenizer.downsample
 
     def features(
         self, latents: Float[Tensor, "B L C"], frames: Bool[Tensor, "B T"] | None = None

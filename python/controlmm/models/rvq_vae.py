@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from controlmm.nn.checkpoint import PretrainedModel
+from controlmm.models.tokenizer import MotionTokenizer
 from controlmm.nn.conv import ConvDecoder, ConvEncoder
-from controlmm.nn.quantizer import Quantized, ResidualQuantizer
+from controlmm.nn.quantizer import ResidualQuantizer
 
 
 @dataclass(frozen=True)
@@ -62,12 +62,13 @@ class RvqVaeConfig:
         return replace(self, feature_dim=feature_dim)
 
 
-class RvqVae(PretrainedModel):
+class RvqVae(MotionTokenizer):
     """Normalised features (B, T, D) <-> tokens, which are ids (B, L, Q) or latents (B, L, C)."""
 
     config_class: ClassVar[type] = RvqVaeConfig
     training_state: ClassVar[tuple[str, ...]] = ("ema_sum", "ema_count")
     config: RvqVaeConfig
+    quantizer: ResidualQuantizer
 
     def __init__(self, config: RvqVaeConfig) -> None:
         super().__init__(config)
@@ -85,67 +86,17 @@ class RvqVae(PretrainedModel):
             takes_first_rows=config.takes_first_rows,
         )
 
-    def forward(
-        self, features: Float[Tensor, "B T D"], valid: Bool[Tensor, "B T"] | None = None
-    ) -> tuple[Float[Tensor, "B T D"], Quantized]:
-        """Reconstruction and quantisation of ``features``; see :meth:`encode_latents` for the arguments."""
-        quantized = self.quantizer(self.encode_latents(features, valid), self._token_mask(valid))
-        return self.decode(quantized.latents, valid), quantized
-
     def encode_latents(
         self, features: Float[Tensor, "B T D"], valid: Bool[Tensor, "B T"] | None = None
     ) -> Float[Tensor, "B L C"]:
-        """Encoder output before quantisation.
-
-        Args:
-            features: Normalised; ``T`` a multiple of ``downsample``.
-            valid: Frames that belong to each clip (a prefix, a multiple of ``downsample``); ``None`` means
-                all. With it, a clip's result does not depend on the padding.
-
-        Raises:
-            ValueError: If ``T`` is no multiple of ``downsample``.
-        """
-        if features.shape[1] % self.config.downsample:
-            raise ValueError(
-                f"`features` must have a multiple of {self.config.downsample} frames, "
-                f"got {features.shape[1]}."
-            )
-        latents: Tensor = self.encoder(features.transpose(1, 2), valid)
+        """See :meth:`MotionTokenizer.encode_latents`."""
+        latents: Tensor = self.encoder(self._encoder_input(features), valid)
         return latents.transpose(1, 2)
-
-    def encode(
-        self, features: Float[Tensor, "B T D"], valid: Bool[Tensor, "B T"] | None = None
-    ) -> Int[Tensor, "B L Q"]:
-        """Token ids; -1 in padding. Use in evaluation mode: training mode draws codes at random."""
-        quantized: Quantized = self.quantizer(self.encode_latents(features, valid), self._token_mask(valid))
-        return quantized.ids
-
-    def decode(
-        self, latents: Float[Tensor, "B L C"], valid: Bool[Tensor, "B T"] | None = None
-    ) -> Float[Tensor, "B T D"]:
-        """Normalised features of latents."""
-        return self.decode_channels(latents, valid).transpose(1, 2)
-
-    def decode_channels(
-        self, latents: Float[Tensor, "B L C"], valid: Bool[Tensor, "B T"] | None = None
-    ) -> Float[Tensor, "B D T"]:
-        """Like :meth:`decode` but channel-major, as the last convolution emits it."""
-        decoded: Tensor = self.decoder(latents.transpose(1, 2), valid)
-        return decoded
-
-    def decode_ids(
-        self, ids: Int[Tensor, "B L Q"], valid: Bool[Tensor, "B T"] | None = None
-    ) -> Float[Tensor, "B T D"]:
-        """Normalised features of token ids; -1 adds nothing."""
-        return self.decode(self.quantizer.lookup(ids), valid)
 
     @property
     def base_codes(self) -> Float[Tensor, "K C"]:
         """The codes of layer 0, which the masked transformer predicts."""
         return self.quantizer.book(0).codes
-
-    def _token_mask(self, valid: Tensor | None) -> Tensor | None:
-        return None if valid is None else valid[:, :: self.config.downsample]
 
 
 def frame_mask(lengths: Int[Tensor, "B"], frames: int) -> Bool[Tensor, "B T"]:

@@ -23,6 +23,14 @@ class Quantized:
     perplexity: Float[Tensor, ""]  # of each batch's code histogram, mean over the active layers
 
 
+class Quantizer(nn.Module):
+    """Latents (B, L, C) -> :class:`Quantized`; calling it in training mode also updates its codebooks."""
+
+    def lookup(self, ids: Int[Tensor, "B L Q"]) -> Float[Tensor, "B L C"]:
+        """Latents of code ids; -1 adds nothing."""
+        raise NotImplementedError
+
+
 class EmaCodebook(nn.Module):
     """``K`` codes, each the running mean of the vectors that chose it; all state is in the state dict."""
 
@@ -72,7 +80,7 @@ class EmaCodebook(nn.Module):
         self.is_initialized.fill_(True)
 
 
-class ResidualQuantizer(nn.Module):
+class ResidualQuantizer(Quantizer):
     """``Q`` codebooks; each quantises what the ones before it left over."""
 
     def __init__(
@@ -112,7 +120,7 @@ class ResidualQuantizer(nn.Module):
         for layer in range(self._active_layers()):
             chosen, codes = self._quantize_layer(self.book(layer), residual, keep)
             commitments.append((residual - codes.detach())[keep].square().mean())
-            perplexities.append(_perplexity(chosen[keep], len(self.book(layer).codes)))
+            perplexities.append(perplexity(chosen[keep], len(self.book(layer).codes)))
             latents = latents + residual + (codes - residual).detach()
             residual = residual - codes.detach()
             ids.append(torch.where(keep, chosen, -1))
@@ -170,6 +178,7 @@ def _at_least(x: Float[Tensor, "N C"], count: int) -> Float[Tensor, "N C"]:
     return noisy
 
 
-def _perplexity(ids: Int[Tensor, "N"], num_codes: int) -> Float[Tensor, ""]:
+def perplexity(ids: Int[Tensor, "N"], num_codes: int) -> Float[Tensor, ""]:
+    """Exponential of the entropy of the codes' histogram: how many codes are in use."""
     share = torch.bincount(ids, minlength=num_codes) / max(1, len(ids))
     return (-(share * (share + 1e-7).log()).sum()).exp()

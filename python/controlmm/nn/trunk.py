@@ -12,11 +12,13 @@ from torch import Tensor, nn
 _WEIGHT_STD = 0.02
 
 
-def encoder_layers(count: int, *, width: int, heads: int, feedforward: int, dropout: float) -> nn.ModuleList:
-    """``count`` standard post-norm encoder layers with exact GELU."""
+def encoder_layers(
+    count: int, *, width: int, heads: int, feedforward: int, dropout: float, activation: str = "gelu"
+) -> nn.ModuleList:
+    """``count`` standard post-norm encoder layers with exact GELU (or ``activation="relu"``)."""
     return nn.ModuleList(
         nn.TransformerEncoderLayer(
-            width, heads, feedforward, dropout, activation="gelu", layer_norm_eps=1e-5, batch_first=True
+            width, heads, feedforward, dropout, activation=activation, layer_norm_eps=1e-5, batch_first=True
         )
         for _ in range(count)
     )

@@ -21,8 +21,12 @@ MODULES = {
     "residual": "residual",
     "control": "control",
     "evaluator": "evaluator",
+    "tl-vq": "tl_vq",
+    "tl-mtt": "tl_mtt",
+    "tl-unsplit": "tl_unsplit",
 }
 CONTROLMM_STAGES = ("rvq", "masked", "residual", "control")  # that `controlmm assemble` puts together
+TLCONTROL_STAGES = ("tl-vq", "tl-mtt")
 
 
 def load_stage(name: str) -> Stage:

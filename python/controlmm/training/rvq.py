@@ -13,12 +13,13 @@ from torch.nn.functional import l1_loss, smooth_l1_loss
 
 from controlmm.data.clip import FeatureClip
 from controlmm.models.rvq_vae import RvqVae, RvqVaeConfig
+from controlmm.models.tokenizer import MotionTokenizer
 from controlmm.motion.layout import feature_layout
 from controlmm.motion.normalizer import ROOT_CONTACT_BIAS, Normalizer
 from controlmm.ops import recover_joints
 from controlmm.training.loop import Recipe
 from controlmm.training.settings import TrainingSettings
-from controlmm.training.stage import NORMALIZER_FILE, Stage, StageInputs, by_size
+from controlmm.training.stage import Stage, StageInputs, by_size, fit_normalizer
 from controlmm.training.windows import WindowSampler
 
 WINDOW = 64  # frames
@@ -115,7 +116,7 @@ class RvqRecipe:
 
 
 def reconstruction_errors(
-    model: RvqVae, normalizer: Normalizer, clips: Sequence[FeatureClip]
+    model: MotionTokenizer, normalizer: Normalizer, clips: Sequence[FeatureClip]
 ) -> dict[str, float]:
     """Mean joint position error of encode -> quantise -> decode over whole clips (each cut to whole tokens).
 
@@ -157,14 +158,8 @@ def layer_perplexities(ids: Int[Tensor, "N Q"]) -> dict[str, float]:
 
 
 def _build(config: RvqVaeConfig, inputs: StageInputs) -> Recipe:
-    if not inputs.train_clips:
-        raise ValueError("The training split has no readable clip.")
     options: RvqOptions = inputs.options
-    normalizer = Normalizer.fit(
-        (clip.features for clip in inputs.train_clips), root_contact_bias=options.root_contact_bias
-    )
-    inputs.root.mkdir(parents=True, exist_ok=True)
-    normalizer.save(inputs.root / NORMALIZER_FILE)
+    normalizer = fit_normalizer(inputs, root_contact_bias=options.root_contact_bias)
     config = config.for_features(normalizer.skeleton.feature_dim)
     return RvqRecipe(config, normalizer, inputs.train_clips, inputs.val_clips, options=options)
 

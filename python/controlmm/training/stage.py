@@ -14,7 +14,8 @@ from torch import Tensor
 from controlmm.data.clip import FeatureClip
 from controlmm.data.folder import MotionFolder
 from controlmm.models.rvq_vae import RvqVae
-from controlmm.motion.normalizer import Normalizer
+from controlmm.models.tokenizer import MotionTokenizer
+from controlmm.motion.normalizer import ROOT_CONTACT_BIAS, Normalizer
 from controlmm.text import TextEncoder, encode_all
 from controlmm.training.loop import Recipe
 from controlmm.training.settings import TrainingSettings
@@ -46,9 +47,10 @@ class StageInputs:
         features = encode_all(texts, self.text_encoder, cache, progress=self.progress)
         return dict(zip(texts, features, strict=True))
 
-    def token_samplers(self) -> tuple[TokenSampler, TokenSampler]:
-        """Training and validation clips as tokens of the stage ``rvq``, with their captions."""
-        tokenizer, normalizer = load_tokenizer(self.root)
+    def token_samplers(self, tokenizer: MotionTokenizer | None = None) -> tuple[TokenSampler, TokenSampler]:
+        """Training and validation clips as tokens, by default of the stage ``rvq``, with their captions."""
+        tokenizer = load_tokenizer(self.root)[0] if tokenizer is None else tokenizer
+        normalizer = Normalizer.load(self.root / NORMALIZER_FILE)
         features = self.text_features()
         shortest = MIN_FRAMES if normalizer.skeleton.unit == "m" else _MIN_FRAMES_KIT
         train, val = (
@@ -94,6 +96,22 @@ def best_weights(root: Path, stage: str) -> Path:
             f"{root / stage} holds no trained stage. Run `controlmm train {stage}` with the same --out first."
         )
     return folder
+
+
+def fit_normalizer(inputs: StageInputs, *, root_contact_bias: float = ROOT_CONTACT_BIAS) -> Normalizer:
+    """Feature statistics of the training split, which the first stage of a model writes into its root.
+
+    Raises:
+        ValueError: If the training split is empty.
+    """
+    if not inputs.train_clips:
+        raise ValueError("The training split has no readable clip.")
+    normalizer = Normalizer.fit(
+        (clip.features for clip in inputs.train_clips), root_contact_bias=root_contact_bias
+    )
+    inputs.root.mkdir(parents=True, exist_ok=True)
+    normalizer.save(inputs.root / NORMALIZER_FILE)
+    return normalizer
 
 
 def load_tokenizer(root: str | Path) -> tuple[RvqVae, Normalizer]:

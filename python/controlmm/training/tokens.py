@@ -12,7 +12,8 @@ from torch.nn.utils.rnn import pad_sequence
 from tqdm import tqdm
 
 from controlmm.data.clip import Caption, FeatureClip
-from controlmm.models.rvq_vae import RvqVae, frame_mask
+from controlmm.models.rvq_vae import frame_mask
+from controlmm.models.tokenizer import MotionTokenizer
 from controlmm.motion.normalizer import Normalizer
 from controlmm.training.windows import source_weights
 
@@ -60,7 +61,7 @@ class TokenSampler:
         self,
         clips: Sequence[FeatureClip],
         normalizer: Normalizer,
-        tokenizer: RvqVae,
+        tokenizer: MotionTokenizer,
         text_features: Mapping[str, Float[Tensor, "E"]],
         *,
         progress: bool = True,
@@ -160,7 +161,7 @@ def near_lengths(lengths: Int[Tensor, "N"], weights: Float[Tensor, "N"], count: 
 
 @torch.no_grad()
 def tokenize(
-    features: Sequence[Float[Tensor, "T D"]], tokenizer: RvqVae, *, progress: bool
+    features: Sequence[Float[Tensor, "T D"]], tokenizer: MotionTokenizer, *, progress: bool
 ) -> list[list[Int[Tensor, "L Q"]]]:
     """Ids of every clip at every frame offset. Similar lengths go together, so little is spent on padding."""
     tokenizer.eval()

@@ -52,3 +52,29 @@ class WindowSampler:
     def at(self, starts: Int[Tensor, "B"]) -> Float[Tensor, "B T D"]:
         """The windows that begin at frames ``starts`` of the concatenated clips."""
         return self.frames[starts[:, None] + torch.arange(self.length)]
+
+
+class PaddedClipSampler:
+    """Whole clips with zeros behind them, normalised: what the published TLControl tokenizer was trained on.
+
+    Raises:
+        ValueError: If there is no clip.
+    """
+
+    def __init__(self, clips: Sequence[FeatureClip], normalizer: Normalizer, *, length: int) -> None:
+        if not clips:
+            raise ValueError("The training split has no readable clip.")
+        self.length = length
+        self._clips = [normalizer.normalize(clip.features) for clip in clips]
+        self._weights = source_weights([clip.source for clip in clips], [1] * len(clips))
+
+    def sample(self, count: int) -> Float[Tensor, "B T D"]:
+        """``count`` padded clips from torch's global random state; too long ones are cut at random."""
+        chosen = torch.multinomial(self._weights, count, replacement=True).tolist()
+        batch = torch.zeros(count, self.length, self._clips[0].shape[1])
+        for row, index in zip(batch, chosen, strict=True):
+            clip = self._clips[index]
+            first = int(torch.randint(max(0, len(clip) - self.length) + 1, ()))
+            clip = clip[first : first + self.length]
+            row[: len(clip)] = clip
+        return batch
