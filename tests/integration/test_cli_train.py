@@ -93,6 +93,22 @@ def test_the_stages_become_a_model_that_generates(root: Path, command: Command, 
     assert Motion.load(tmp_path / "walk_0_0.npz").num_frames == 16
 
 
+def test_a_length_estimator_comes_along_and_says_how_long(
+    root: Path, data: Path, command: Command, tmp_path: Path
+) -> None:
+    shutil.copytree(root, tmp_path / "root")
+    arguments = ("--data", data, "--config", "tiny", "--text", "hashing", "--out", tmp_path / "root")
+    command("train", "length", *arguments, "--steps", 4, "--batch-size", 2, "--quiet")
+    command("assemble", tmp_path / "root", "--out", tmp_path / "model")
+    out = tmp_path / "out"
+    command(
+        "generate", "a person walks", "--model", tmp_path / "model", "--preset", "fast", "--formats", "npz",
+        "--out", out, "--seed", 2, "--quiet",
+    )  # fmt: skip
+    expected = ControlMM.from_pretrained(tmp_path / "model")("a person walks", preset="fast", seed=2)
+    assert Motion.load(next(out.glob("*.npz"))).num_frames == expected.best.num_frames
+
+
 def test_plot_draws_the_curves(root: Path, command: Command, tmp_path: Path) -> None:
     command("plot", root / "rvq", "--out", tmp_path / "rvq.png")
     with Image.open(tmp_path / "rvq.png") as picture:

@@ -28,6 +28,7 @@ def assemble(
     import torch
 
     from controlmm.models.control_branch import ControlBranch
+    from controlmm.models.length_estimator import LengthEstimator
     from controlmm.models.masked_transformer import MaskedTransformer
     from controlmm.models.residual_transformer import ResidualTransformer
     from controlmm.pipelines import ControlMM
@@ -42,6 +43,7 @@ def assemble(
         control=ControlBranch.from_pretrained(_best(root, "control")),
         normalizer=normalizer,
         text_encoder=_text_encoder(root, text, text_folder),
+        length=LengthEstimator.from_pretrained(_best(root, "length")) if (root / "length").is_dir() else None,
     )
     pipeline.save_pretrained(out, dtype=torch.float16 if half else torch.float32)
     stages = {
@@ -49,6 +51,7 @@ def assemble(
         "transformer": "masked",
         "residual": "residual",
         "control": "control",
+        "length": "length",
     }
     for network, stage in stages.items():
         if (root / stage / SETTINGS_FILE).is_file():  # not there when a stage came from a model without it

@@ -27,7 +27,10 @@ def generate(
     ] = None,
     seconds: Annotated[
         float | None,
-        typer.Option(help="Length, 0.4 to 9.8. By default the control file's, else 6.", show_default=False),
+        typer.Option(
+            help="Length, 0.4 to 9.8. By default the control file's, else the model's choice or 6.",
+            show_default=False,
+        ),
     ] = None,
     controls: Annotated[Path | None, typer.Option(help="Control file: .json, .csv, .npy or .npz.")] = None,
     preset: Annotated[str, typer.Option(help="fast, balanced or accurate.")] = "balanced",

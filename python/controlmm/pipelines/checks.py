@@ -10,6 +10,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from controlmm.models.control_branch import ControlBranchConfig
+from controlmm.models.length_estimator import LengthEstimatorConfig
 from controlmm.models.masked_transformer import MaskedTransformerConfig
 from controlmm.models.residual_transformer import ResidualTransformerConfig
 from controlmm.models.rvq_vae import RvqVaeConfig
@@ -69,6 +70,7 @@ def check_sizes(
     control: ControlBranchConfig,
     skeleton: Skeleton,
     text_dim: int,
+    length: LengthEstimatorConfig | None = None,
 ) -> None:
     """Raise ``ValueError`` unless networks, statistics and text encoder were made for each other."""
     for name, part, wanted, found in (
@@ -79,6 +81,7 @@ def check_sizes(
         ("downsample", "control", tokenizer.downsample, control.downsample),
         ("text_dim", "transformer", text_dim, transformer.text_dim),
         ("text_dim", "residual", text_dim, residual.text_dim),
+        ("text_dim", "length", text_dim, text_dim if length is None else length.text_dim),
     ):
         if wanted != found:
             raise ValueError(f"The parts do not fit: `{name}` of `{part}` must be {wanted}, got {found}.")

@@ -23,6 +23,7 @@ from controlmm.generation.noise import ClipNoise
 from controlmm.generation.objective import ControlObjective
 from controlmm.generation.solvers import Progress, Stopping, adamw
 from controlmm.models.control_branch import ControlBranch
+from controlmm.models.length_estimator import LengthEstimator
 from controlmm.models.masked_transformer import MaskedTransformer
 from controlmm.models.residual_transformer import ResidualTransformer
 from controlmm.models.rvq_vae import RvqVae, frame_mask
@@ -55,6 +56,7 @@ class ControlMM(MotionPipeline):
         control: ControlBranch,
         normalizer: Normalizer,
         text_encoder: TextEncoder,
+        length: LengthEstimator | None = None,
     ) -> None:
         control.config.check_base(transformer.config)
         check_sizes(
@@ -64,7 +66,9 @@ class ControlMM(MotionPipeline):
             control=control.config,
             skeleton=normalizer.skeleton,
             text_dim=text_encoder.dim,
+            length=None if length is None else length.config,
         )
+        self.length = None if length is None else length.eval().requires_grad_(False)
         self.transformer = transformer.eval().requires_grad_(False)
         self.residual = residual.eval().requires_grad_(False)
         self.control = control.eval().requires_grad_(False)
@@ -100,6 +104,9 @@ class ControlMM(MotionPipeline):
             control=ControlBranch.from_pretrained(folder / "control"),
             normalizer=Normalizer.load(folder / files.NORMALIZER_FILE),
             text_encoder=text_encoder,
+            length=LengthEstimator.from_pretrained(folder / "length")
+            if (folder / "length").is_dir()
+            else None,
         )
 
     def networks(self) -> dict[str, PretrainedModel]:
@@ -109,6 +116,7 @@ class ControlMM(MotionPipeline):
             "transformer": self.transformer,
             "residual": self.residual,
             "control": self.control,
+            **({} if self.length is None else {"length": self.length}),
         }
 
     @torch.no_grad()

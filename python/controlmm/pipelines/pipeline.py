@@ -6,6 +6,7 @@ import dataclasses
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
@@ -17,14 +18,16 @@ from controlmm.controls import Control
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.noise import clip_seeds
 from controlmm.generation.solvers import Progress
+from controlmm.models.length_estimator import LengthEstimator
 from controlmm.motion.skeleton import Skeleton
 from controlmm.nn.checkpoint import PretrainedModel
 from controlmm.pipelines import folder as files
 from controlmm.pipelines.checks import check_sampling
+from controlmm.pipelines.length import draw_frames
 from controlmm.pipelines.output import GenerationResult
 from controlmm.pipelines.presets import Preset, resolve_preset
 from controlmm.pipelines.scene import Scene
-from controlmm.text import TextEncoder
+from controlmm.text import TextEncoder, check_prompt
 
 MAX_FRAMES = 196
 
@@ -35,6 +38,7 @@ class MotionPipeline(ABC):
     kind: ClassVar[str]  # in pipeline.json
     decoder: MotionDecoder
     text_encoder: TextEncoder
+    length: LengthEstimator | None = None  # draws the length of motions whose caller does not say
 
     @abstractmethod
     def generate_latents(
@@ -78,7 +82,8 @@ class MotionPipeline(ABC):
 
         Args:
             prompt: What the person does, in words.
-            seconds: Length, 0.4 to 9.8 s; or pass ``frames`` (8 to 196, at 20 fps). 6 s without either.
+            seconds: Length, 0.4 to 9.8 s; or pass ``frames`` (8 to 196, at 20 fps). Without either, a
+                length drawn by the model's length estimator if it has one, else 6 s.
             frames: Length in frames.
             controls: Targets in metres, Y up, ground at y = 0. The body starts facing +Z (its left is +X), at
                 x = z = 0 unless a control names the pelvis at frame 0. Contradicting or impossible frames are
@@ -97,14 +102,11 @@ class MotionPipeline(ABC):
         plan = resolve_preset(preset)
         if guidance_scale is not None:
             plan = dataclasses.replace(plan, guidance_scale=guidance_scale)
-        scene = Scene.of_call(
-            prompt,
-            controls,
-            seconds=seconds,
-            frames=frames,
-            skeleton=self.skeleton,
-            max_frames=MAX_FRAMES,
-        )
+        arrange = partial(Scene.of_call, prompt, controls, skeleton=self.skeleton, max_frames=MAX_FRAMES)
+        if seconds is None and frames is None and self.length is not None:
+            arrange(seconds=None, frames=MAX_FRAMES)  # an unusable call is refused before any network runs
+            frames = self._drawn_frames(self.length, prompt, controls, seed)
+        scene = arrange(seconds=seconds, frames=frames)
         canonical = scene.canonical
         latents = self.generate_latents(
             self.text_encoder.encode([scene.prompt]).pooled.expand(samples, -1),
@@ -117,6 +119,20 @@ class MotionPipeline(ABC):
         )
         features = self.decoder.features(latents)[:, : scene.frames]
         return scene.result(features, latents, seconds_taken=time.perf_counter() - started)
+
+    def _drawn_frames(
+        self, estimator: LengthEstimator, prompt: str, controls: Sequence[Control], seed: int
+    ) -> int:
+        text = self.text_encoder.encode([check_prompt(prompt)]).pooled
+        return draw_frames(
+            estimator,
+            text,
+            controls=controls,
+            skeleton=self.skeleton,
+            max_frames=MAX_FRAMES,
+            downsample=self.decoder.downsample,
+            seed=seed,
+        )
 
     @property
     def skeleton(self) -> Skeleton:

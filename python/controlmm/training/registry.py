@@ -20,6 +20,7 @@ MODULES = {
     "masked": "masked",
     "residual": "residual",
     "control": "control",
+    "length": "length",
     "evaluator": "evaluator",
     "tl-vq": "tl_vq",
     "tl-mtt": "tl_mtt",
