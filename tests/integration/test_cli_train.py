@@ -69,7 +69,13 @@ def test_every_stage_leaves_weights_settings_and_its_command(root: Path) -> None
         assert (root / stage / "best" / "model.safetensors").is_file()
         settings = json.loads((root / stage / "run.json").read_text())["settings"]
         assert (settings["steps"], settings["batch_size"]) == (4, 2)
-        assert (root / stage / "command.txt").read_text().startswith("controlmm")
+        start = json.loads((root / stage / "starts.jsonl").read_text())
+        assert start.keys() >= {"command", "version", "revision", "torch", "time"}
+        clips = (root / stage / "clips.tsv").read_text().splitlines()
+        assert clips[0] == "split\tid\tframes\tsha256"
+        assert {line.split("\t")[0] for line in clips[1:]} == {"train", "val"}
+        with Image.open(root / stage / "curves.png") as picture:
+            assert picture.size[0] > 1000
     assert json.loads((root / "text_encoder.json").read_text())["kind"] == "hashing"
 
 
@@ -223,7 +229,9 @@ def test_a_killed_run_ends_with_the_weights_of_an_unbroken_one(
         assert torch.equal(value, expected[name]), name
     log = [json.loads(line) for line in (killed / "rvq" / "metrics.jsonl").read_text().splitlines()]
     assert log == [json.loads(line) for line in (unbroken / "rvq" / "metrics.jsonl").read_text().splitlines()]
-    assert (killed / "rvq" / "command.txt").read_text().splitlines()[0].endswith("--threads 1 --quiet")
+    starts = [json.loads(line) for line in (killed / "rvq" / "starts.jsonl").read_text().splitlines()]
+    assert len(starts) == 2
+    assert starts[0]["command"].endswith("--threads 1 --quiet")
 
 
 def _kill_after_a_checkpoint(arguments: list[str], run: Path) -> None:

@@ -13,14 +13,14 @@ from controlmm.models.residual_transformer import ResidualTransformer
 from controlmm.motion.normalizer import Normalizer
 from controlmm.pipelines import ControlMM
 from controlmm.text.hashing import HashingTextEncoder
-from controlmm.training import loop
 from controlmm.training.registry import MODULES, load_stage
 from controlmm.training.run_folder import RunFolder
 from controlmm.training.stage import load_tokenizer
 from controlmm.training.stages import train_stage
+from controlmm.training.step import StepTaker
 
 STAGES = ("rvq", "rvq-decoder", "masked", "residual", "control")
-QUICK = {"steps": 10, "validate_every": 5}
+QUICK = {"steps": 10, "validate_every": 5, "average_decay": 0.9}
 
 
 def train(stage, data, root, **changes):
@@ -37,7 +37,7 @@ def train(stage, data, root, **changes):
 
 @pytest.fixture(scope="module")
 def trained(tiny_data_folder, tmp_path_factory):
-    """A root folder with all stages trained for ten steps."""
+    """A root folder with all stages trained for ten steps, with averaged weights."""
     root = tmp_path_factory.mktemp("trained")
     for stage in STAGES:
         train(stage, tiny_data_folder, root)
@@ -106,17 +106,17 @@ def test_a_killed_and_resumed_stage_equals_the_unbroken_one_bit_by_bit(
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).symlink_to(trained / name)
     run = tmp_path / stage
-    take_step = loop._take_step
+    take = StepTaker.take
 
-    def killed_at_eight(recipe, settings, optimizer, parameters, step):
+    def killed_at_eight(self, step):
         if step == 7:
             raise KilledError
-        return take_step(recipe, settings, optimizer, parameters, step)
+        return take(self, step)
 
-    monkeypatch.setattr(loop, "_take_step", killed_at_eight)
+    monkeypatch.setattr(StepTaker, "take", killed_at_eight)
     with pytest.raises(KilledError):
         train(stage, tiny_data_folder, tmp_path)
-    monkeypatch.setattr(loop, "_take_step", take_step)
+    monkeypatch.setattr(StepTaker, "take", take)
     train(stage, tiny_data_folder, tmp_path)
 
     for name in ("checkpoint.safetensors", "best/model.safetensors"):
@@ -136,7 +136,7 @@ def test_other_data_is_not_mixed_into_a_run(trained, tiny_data_folder, walk, tmp
 
     clips = [Clip(s, walk(70), (Caption("walks"),), split=s) for s in ("train", "val")]
     write_folder(clips, tmp_path, progress=False)
-    with pytest.raises(ValueError, match="masked holds a run with another data"):
+    with pytest.raises(ValueError, match="masked holds a run with another captions, data"):
         train("masked", tmp_path, trained)
 
 

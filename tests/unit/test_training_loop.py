@@ -4,16 +4,23 @@ from __future__ import annotations
 
 import json
 import math
+import subprocess
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import ClassVar
 
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file
 from torch import nn
 
+import controlmm
 from controlmm.nn.checkpoint import PretrainedModel
+from controlmm.training import provenance
+from controlmm.training.averaging import WeightAverage
 from controlmm.training.loop import train
+from controlmm.training.processes import Processes
 from controlmm.training.run_folder import RunFolder
 from controlmm.training.settings import TrainingSettings
 
@@ -93,10 +100,19 @@ def test_without_milestones_the_rate_falls_by_a_cosine_to_a_hundredth():
 
 
 @pytest.mark.parametrize(
-    "changes", [{"steps": 0}, {"batch_size": 0}, {"learning_rate": 0.0}, {"validate_every": 0}]
+    ("changes", "message"),
+    [
+        ({"steps": 0}, "`steps`, `batch_size`, `shards` and the intervals must be at least 1"),
+        ({"batch_size": 0}, "must be at least 1"),
+        ({"shards": 0}, "must be at least 1"),
+        ({"validate_every": 0}, "must be at least 1"),
+        ({"learning_rate": 0.0}, r"`learning_rate` must be positive, got 0\.0"),
+        ({"patience": -1}, r"`patience` must be 0 \(never\) or a number of validations, got -1"),
+        ({"average_decay": 1.0}, r"`average_decay` must be in \[0, 1\), such as 0\.999, got 1\.0"),
+    ],
 )
-def test_impossible_settings_are_refused(changes):
-    with pytest.raises(ValueError, match=next(iter(changes)) if "rate" in str(changes) else "at least 1"):
+def test_impossible_settings_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
         replace(SETTINGS, **changes)
 
 
@@ -115,24 +131,32 @@ class StoppedError(Exception):
     """The kill."""
 
 
+AVERAGED = replace(SETTINGS, average_decay=0.9, patience=3, shards=2)
+
+
 @pytest.mark.parametrize("stop_at", [10, 20])
-def test_a_stopped_and_resumed_run_equals_an_unbroken_one_bit_by_bit(tmp_path, stop_at):
+@pytest.mark.parametrize("settings", [SETTINGS, AVERAGED], ids=["plain", "averaged"])
+def test_a_stopped_and_resumed_run_equals_an_unbroken_one_bit_by_bit(tmp_path, stop_at, settings):
     unbroken, resumed = tmp_path / "unbroken", tmp_path / "resumed"
-    expected = fit(LineRecipe(), unbroken).state_dict()
+    expected = fit(LineRecipe(), unbroken, settings).state_dict()
 
     def stop(step):
         if step == stop_at:  # after the validation, before the checkpoint of this step
             raise StoppedError
 
     with pytest.raises(StoppedError):
-        fit(LineRecipe(), resumed, on_validation=stop)
+        fit(LineRecipe(), resumed, settings, on_validation=stop)
     recipe = LineRecipe()
-    actual = fit(recipe, resumed).state_dict()
-    assert recipe.calls == SETTINGS.steps - (stop_at - SETTINGS.checkpoint_every)
+    actual = fit(recipe, resumed, settings).state_dict()
+    assert recipe.calls == settings.shards * (SETTINGS.steps - (stop_at - SETTINGS.checkpoint_every))
     assert all(torch.equal(actual[name], expected[name]) for name in expected)
     for name in ("checkpoint.safetensors", "best/model.safetensors"):
         first, second = load_file(unbroken / name), load_file(resumed / name)
+        assert first.keys() == second.keys()
         assert all(torch.equal(first[key], second[key]) for key in first)
+    assert any(name.startswith("average.") for name in load_file(unbroken / "checkpoint.safetensors")) == (
+        settings is AVERAGED
+    )
     assert RunFolder(resumed).records() == RunFolder(unbroken).records()
 
 
@@ -200,10 +224,7 @@ def test_twenty_bad_steps_in_a_row_end_the_run_and_keep_the_good_checkpoint(tmp_
     with pytest.raises(ValueError, match="not finite for 20 steps up to step 33"):
         fit(recipe, tmp_path)
     assert recipe.calls == 33
-    model = LineRecipe().model
-    optimizer = torch.optim.AdamW(model.parameters())
-    step, _ = RunFolder(tmp_path).load_checkpoint(model, optimizer)
-    assert step == 10  # steps 15 to 30 were bad
+    assert _progress(tmp_path)["step"] == 10  # steps 15 to 30 were bad
 
 
 def test_nineteen_bad_steps_do_not_end_the_run(tmp_path):
@@ -214,15 +235,13 @@ def test_nineteen_bad_steps_do_not_end_the_run(tmp_path):
 
 def test_a_score_that_is_no_number_is_never_the_best(tmp_path):
     fit(LineRecipe(scores=[math.nan, 3.0, math.nan, 4.0]), tmp_path)
-    metadata = json.loads(_metadata(tmp_path / "checkpoint.safetensors")["progress"])
-    assert metadata == {"step": 40, "best": 3.0}
+    progress = _progress(tmp_path)
+    assert (progress["step"], progress["best"], progress["best_step"], progress["stale"]) == (40, 3.0, 20, 2)
 
 
-def _metadata(path):
-    from safetensors import safe_open
-
-    with safe_open(path, framework="pt") as file:
-        return file.metadata()
+def _progress(run):
+    with safe_open(run / "checkpoint.safetensors", framework="pt") as file:
+        return json.loads(file.metadata()["progress"])
 
 
 def test_gradients_are_clipped(tmp_path):
@@ -230,3 +249,103 @@ def test_gradients_are_clipped(tmp_path):
     fit(LineRecipe(), tmp_path, settings)
     (record,) = [record for record in RunFolder(tmp_path).records() if "gradient_norm" in record]
     assert record["gradient_norm"] > 1e-3  # the norm before clipping is logged
+
+
+def test_the_average_of_the_weights_is_what_the_formula_says():
+    """Decay min(0.9, (1 + n) / (10 + n)) before update n: 0.1, 2/11, 3/12, ..."""
+    model = nn.Linear(1, 1, bias=False)
+    average = WeightAverage(model, 0.9)
+    expected, values = model.weight.item(), [3.0, -1.0, 2.0]
+    for n, value in enumerate(values):
+        model.weight.data.fill_(value)
+        average.update()
+        decay = min(0.9, (1 + n) / (10 + n))
+        expected = decay * expected + (1 - decay) * value
+    with average.applied():
+        assert model.weight.item() == pytest.approx(expected, rel=1e-6)
+    assert model.weight.item() == values[-1]
+
+
+def test_averaged_weights_are_validated_and_kept(tmp_path):
+    """A rate so high that the weights jump about: their average lies nearer to the truth."""
+    settings = replace(SETTINGS, learning_rate=0.3, steps=60, warmup=0, milestones=(1000,))
+    seen = []
+    recipe = LineRecipe()
+    fit(
+        recipe, tmp_path / "averaged", replace(settings, average_decay=0.95),
+        on_validation=lambda step: seen.append(recipe.model.layer.weight.clone()),
+    )  # fmt: skip
+    scores = [r["val_score"] for r in RunFolder(tmp_path / "averaged").records() if "val_score" in r]
+    for weight, score in zip(seen, scores, strict=True):
+        assert (weight - 1).abs().sum().item() == pytest.approx(score, abs=1e-5)
+    best = Line.from_pretrained(tmp_path / "averaged" / "best").layer.weight
+    assert (best - 1).abs().sum().item() == pytest.approx(min(scores), abs=1e-5)
+    last = load_file(tmp_path / "averaged" / "checkpoint.safetensors")
+    assert torch.equal(last["model.layer.weight"], recipe.model.layer.weight)  # the run goes on with its own
+    assert torch.equal(last["average.layer.weight"], seen[-1])
+    assert not torch.equal(seen[-1], recipe.model.layer.weight)
+
+
+def test_a_run_without_a_better_score_ends_early_and_says_so(tmp_path):
+    recipe = LineRecipe(scores=[3.0, 2.0, 2.5, 2.0])
+    fit(recipe, tmp_path, replace(SETTINGS, steps=400, patience=2))
+    assert recipe.calls == 40
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["ended"] == "early, no better validation score"
+    assert (summary["steps"], summary["best_step"], summary["best_score"]) == (40, 20, 2.0)
+    fit(recipe, tmp_path, replace(SETTINGS, steps=400, patience=2))
+    assert recipe.calls == 40  # and stays ended
+
+
+def test_two_shards_are_one_step_of_their_mean_gradient(tmp_path):
+    """Shard k of step 0 is drawn from its own seed; one step is AdamW on the mean of both gradients."""
+    settings = replace(SETTINGS, steps=1, shards=2, clip_norm=0.0, warmup=0, milestones=(9,))
+    trained = fit(LineRecipe(), tmp_path, settings)
+    recipe = LineRecipe()
+    recipe.model.train()
+    optimizer = torch.optim.AdamW(
+        recipe.model.parameters(), lr=settings.learning_rate, betas=settings.betas, weight_decay=0.0
+    )
+    for shard in range(2):
+        torch.manual_seed(settings.seed * 1_000_003 + shard * 1_000_000_007)
+        (recipe.loss(4)["loss"] / 2).backward()
+    optimizer.step()
+    torch.testing.assert_close(trained.layer.weight, recipe.model.layer.weight, rtol=1e-6, atol=1e-7)
+
+
+def test_shards_that_cannot_be_shared_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="`shards` must be a multiple of the 2 processes, got 3"):
+        fit(LineRecipe(), tmp_path, replace(SETTINGS, shards=3), processes=Processes(0, 2))
+
+
+def test_the_folder_says_where_the_run_comes_from(tmp_path):
+    fit(LineRecipe(), tmp_path, files={"clips.tsv": "split\tid\n"})
+    fit(LineRecipe(), tmp_path)
+    first, _ = (json.loads(line) for line in (tmp_path / "starts.jsonl").read_text().splitlines())
+    assert first.keys() >= {"time", "command", "version", "revision", "torch", "device", "processes"}
+    assert first["version"] == controlmm.__version__
+    assert json.loads((tmp_path / "run.json").read_text())["network"] == {"inputs": 3}
+    assert (tmp_path / "clips.tsv").read_text() == "split\tid\n"
+
+
+def test_the_revision_is_that_of_the_checkout_and_of_no_other_repository(tmp_path, monkeypatch):
+    root = Path(__file__).resolve().parents[2]
+    if not ((root / ".git").exists() and Path(provenance.__file__).is_relative_to(root)):
+        pytest.skip("the package does not run from a git checkout")
+    head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=root, capture_output=True, text=True, check=True)
+    assert provenance.git_revision().removesuffix("-dirty") == head.stdout.strip()
+    subprocess.run(["git", "init", "-q", tmp_path], check=True)
+    monkeypatch.setattr(provenance, "__file__", str(tmp_path / "provenance.py"))
+    assert provenance.git_revision() is None
+
+
+def test_a_run_from_before_a_setting_existed_is_resumed(tmp_path):
+    fit(LineRecipe(), tmp_path)
+    told = json.loads((tmp_path / "run.json").read_text())
+    del told["settings"]["patience"], told["settings"]["average_decay"], told["network"]
+    (tmp_path / "run.json").write_text(json.dumps(told))
+    recipe = LineRecipe()
+    fit(recipe, tmp_path)
+    assert recipe.calls == 0
+    with pytest.raises(ValueError, match="holds a run with another settings"):
+        fit(recipe, tmp_path, replace(SETTINGS, patience=4))

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-CURVES_FILE = "curves.png"
+from controlmm.cli.run_pictures import CURVES_FILE
 
 
 def plot(

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from controlmm.cli.run_pictures import CURVES_FILE
 from controlmm.training.registry import MODULES
 
 if TYPE_CHECKING:
     from controlmm.text import TextEncoder
 
-COMMAND_FILE = "command.txt"  # in the run folder: every command line that worked on it
 _INTERRUPTED = 130  # exit code of a command that Ctrl-C ended
 
 _Size = Literal["small", "paper", "tiny"]
@@ -52,15 +50,40 @@ def train(
             help="Change an option of the stage or its network, such as masks=cross; may be repeated.",
         ),
     ] = None,
+    shards: Annotated[
+        int | None,
+        typer.Option(
+            help="A step's batch is this many times --batch-size; processes share the shards. By default one "
+            "for each process of torchrun.",
+            min=1,
+            show_default=False,
+        ),
+    ] = None,
+    average_decay: Annotated[
+        float | None,
+        typer.Option(help="Keep a moving average of the weights, such as 0.999.", show_default=False),
+    ] = None,
+    patience: Annotated[
+        int | None,
+        typer.Option(help="End after this many validations without a better score.", show_default=False),
+    ] = None,
+    validate_every: Annotated[int | None, typer.Option(help="Steps.", show_default=False)] = None,
+    device: Annotated[str, typer.Option(help="Where to train: cpu, cuda, cuda:1, ...")] = "cpu",
     threads: Annotated[
         int | None, typer.Option(help="Threads of torch; by default all.", min=1, show_default=False)
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bars.")] = False,
 ) -> None:
-    """Train one stage; the same command goes on where a stopped or killed run left off."""
+    """Train one stage; the same command goes on where a stopped or killed run left off.
+
+    Several processes train together when torchrun starts the command:
+    torchrun --nproc-per-node 2 --no-python controlmm train STAGE ...
+    """
     import torch
 
+    from controlmm.cli.run_pictures import draw_validation
     from controlmm.data import MotionFolder
+    from controlmm.training.processes import device_of_process, joined_processes
     from controlmm.training.registry import load_stage
     from controlmm.training.stages import train_stage
 
@@ -68,29 +91,42 @@ def train(
         torch.set_num_threads(threads)
     named = dict(map(_name_and_value, options or []))
     MotionFolder(data)  # before anything is written: a missing folder leaves no trace of a run
-    given = {"steps": steps, "batch_size": batch_size, "learning_rate": learning_rate, "seed": seed}
+    given = {
+        "steps": steps,
+        "batch_size": batch_size,
+        "learning_rate": learning_rate,
+        "seed": seed,
+        "average_decay": average_decay,
+        "patience": patience,
+        "validate_every": validate_every,
+    }
     changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    encoder = _load_encoder(text, text_folder, out) if load_stage(stage).uses_text else None
-    _store_command(out / stage)
+    uses_text = load_stage(stage).uses_text
     try:
-        with _validations_above_the_bar(quiet=quiet):
+        with joined_processes() as team, _validations_above_the_bar(quiet=quiet):
+            with team.first_goes_ahead():
+                encoder = _load_encoder(text, text_folder, out) if uses_text else None
             run = train_stage(
                 stage,
                 data=data,
                 size=config,
                 root=out,
                 text_encoder=encoder,
-                changes=changes,
                 options=named,
+                changes=changes | {"shards": shards or team.count},
                 start_from=start_from,
-                progress=not quiet,
+                progress=not quiet and team.is_first,
+                on_validation=draw_validation,
+                processes=team,
+                device=device_of_process(device),
             )
     except KeyboardInterrupt:
         typer.echo(
             f"\nStopped. The same command resumes from the last checkpoint in {out / stage}.", err=True
         )
         raise typer.Exit(_INTERRUPTED) from None
-    typer.echo(f"{run}: done, best weights in {run / 'best'}; see its curves with: controlmm plot {run}")
+    if team.is_first:
+        typer.echo(f"{run}: done, best weights in {run / 'best'}, curves in {run / CURVES_FILE}")
 
 
 def _name_and_value(option: str) -> tuple[str, str]:
@@ -113,12 +149,6 @@ def _load_encoder(kind: str, folder: Path | None, root: Path) -> TextEncoder:
         root.mkdir(parents=True, exist_ok=True)
         write_json(file, encoder.config())
     return encoder
-
-
-def _store_command(run: Path) -> None:
-    run.mkdir(parents=True, exist_ok=True)
-    with (run / COMMAND_FILE).open("a", encoding="utf-8") as file:
-        file.write(shlex.join(["controlmm", *sys.argv[1:]]) + "\n")
 
 
 def _validations_above_the_bar(*, quiet: bool) -> Any:

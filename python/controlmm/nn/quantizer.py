@@ -31,8 +31,22 @@ class Quantizer(nn.Module):
         raise NotImplementedError
 
 
+@dataclass
+class CodebookUpdate:
+    """What batches have in store for a codebook."""
+
+    count: Float[Tensor, "K"]  # vectors that chose each code
+    total: Float[Tensor, "K C"]  # their sums
+    rows: Float[Tensor, "K C"]  # random vectors of the first batch, for codes that died
+    batches: Float[Tensor, ""]
+
+
 class EmaCodebook(nn.Module):
-    """``K`` codes, each the running mean of the vectors that chose it; all state is in the state dict."""
+    """``K`` codes, each the running mean of the vectors that chose it; all state is in the state dict.
+
+    Training moves the codes at once, unless ``is_deferred``: then updates gather until :meth:`apply_update`,
+    so that a training loop can join those of several batches or processes, or drop those of a bad step.
+    """
 
     codes: Tensor
     ema_sum: Tensor
@@ -43,6 +57,8 @@ class EmaCodebook(nn.Module):
         super().__init__()
         self.decay = decay
         self._rows: Callable[[Tensor, int], Tensor] = _first_rows if takes_first_rows else _random_rows
+        self.is_deferred = False
+        self._pending: CodebookUpdate | None = None
         self.register_buffer("codes", torch.zeros(num_codes, dim))
         self.register_buffer("ema_sum", torch.zeros(num_codes, dim))
         self.register_buffer("ema_count", torch.ones(num_codes))
@@ -65,11 +81,37 @@ class EmaCodebook(nn.Module):
         num_codes = len(self.codes)
         count = torch.bincount(ids, minlength=num_codes).to(x.dtype)
         total = torch.zeros_like(self.codes).index_add_(0, ids, x)
-        self.ema_sum.lerp_(total, 1 - self.decay)
-        self.ema_count.lerp_(count, 1 - self.decay)
+        fresh = CodebookUpdate(count, total, self._rows(x, num_codes), torch.ones_like(count[0]))
+        if not self.is_deferred:
+            self.apply_update(fresh)
+        elif self._pending is None:
+            self._pending = fresh
+        else:
+            self._pending.count += fresh.count
+            self._pending.total += fresh.total
+            self._pending.batches += 1
+
+    def pending(self) -> CodebookUpdate:
+        """The updates gathered so far; zeros when there are none."""
+        zeros = torch.zeros_like
+        return self._pending or CodebookUpdate(
+            zeros(self.ema_count), zeros(self.codes), zeros(self.codes), zeros(self.ema_count[0])
+        )
+
+    def forget_pending(self) -> None:
+        """Drop the updates gathered so far."""
+        self._pending = None
+
+    @torch.no_grad()
+    def apply_update(self, update: CodebookUpdate) -> None:
+        """Move the codes; nothing happens for an update without any batch."""
+        if update.batches == 0:
+            return
+        self.ema_sum.lerp_(update.total, 1 - self.decay)
+        self.ema_count.lerp_(update.count, 1 - self.decay)
         alive = (self.ema_count >= _RESET_BELOW)[:, None]
         means = self.ema_sum / self.ema_count.clamp(min=_RESET_BELOW)[:, None]
-        self.codes.copy_(torch.where(alive, means, self._rows(x, num_codes)))
+        self.codes.copy_(torch.where(alive, means, update.rows))
 
     @torch.no_grad()
     def initialize(self, x: Float[Tensor, "N C"]) -> None:

@@ -18,8 +18,8 @@ from controlmm.ops.consistency import Norm
 from controlmm.training import masked
 from controlmm.training.control_masks import MaskMode, sample_masks
 from controlmm.training.corruption import corrupt_tokens
-from controlmm.training.loop import Recipe
 from controlmm.training.masked import token_cross_entropy
+from controlmm.training.recipe import Recipe
 from controlmm.training.soft_tokens import Sampling, mixed_codes
 from controlmm.training.stage import Stage, StageInputs, best_weights, by_size, load_tokenizer
 from controlmm.training.tokens import TokenBatch, TokenSampler

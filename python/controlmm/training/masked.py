@@ -13,7 +13,7 @@ from controlmm.models.masked_transformer import MaskedTransformer, MaskedTransfo
 from controlmm.models.rvq_vae import RvqVae
 from controlmm.nn.trunk import drop_text
 from controlmm.training.corruption import corrupt_tokens
-from controlmm.training.loop import Recipe
+from controlmm.training.recipe import Recipe
 from controlmm.training.settings import TrainingSettings
 from controlmm.training.stage import Stage, StageInputs, by_size, load_tokenizer
 from controlmm.training.tokens import TokenBatch, TokenSampler

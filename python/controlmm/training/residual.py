@@ -13,8 +13,8 @@ from torch import Tensor
 from controlmm.models.residual_transformer import ResidualTransformer, ResidualTransformerConfig
 from controlmm.nn.trunk import drop_text
 from controlmm.training import masked
-from controlmm.training.loop import Recipe
 from controlmm.training.masked import token_cross_entropy
+from controlmm.training.recipe import Recipe
 from controlmm.training.stage import Stage, StageInputs, by_size
 from controlmm.training.tokens import TokenBatch, TokenSampler
 

@@ -1,18 +1,18 @@
-"""The folder of a training run: settings, log, and a checkpoint that survives a kill at any moment."""
+"""The folder of a training run: what it was told, its log, a checkpoint that outlives any kill."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
-import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
-from torch import nn
+from controlmm.training.settings import TrainingSettings
 
 CHECKPOINT_FILE, LOG_FILE, SETTINGS_FILE = "checkpoint.safetensors", "metrics.jsonl", "run.json"
+STARTS_FILE, SUMMARY_FILE = "starts.jsonl", "summary.json"
+_SETTINGS = "settings"  # key of the training settings among what a run was told
 
 
 class RunFolder:
@@ -22,21 +22,28 @@ class RunFolder:
         self.path = Path(path)
 
     @property
+    def checkpoint(self) -> Path:
+        """The checkpoint's file."""
+        return self.path / CHECKPOINT_FILE
+
+    @property
     def has_checkpoint(self) -> bool:
         """Whether there is something to resume."""
-        return (self.path / CHECKPOINT_FILE).is_file()
+        return self.checkpoint.is_file()
 
-    def write_settings(self, settings: dict[str, Any]) -> None:
-        """Store what the run was told.
+    def write_settings(self, told: dict[str, Any], files: Mapping[str, str] | None = None) -> None:
+        """Store what the run was told, and texts beside it (``files``: content by name).
+
+        A run of an older version is resumed although it lacks entries that came later; its settings had the
+        values that are the defaults now.
 
         Raises:
             ValueError: If the folder holds a run with other settings.
         """
         file = self.path / SETTINGS_FILE
         if self.has_checkpoint and file.is_file():
-            before = _read_settings(file)
-            now = json.loads(json.dumps(settings))
-            changed = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
+            before, now = _with_default_settings(_read_json(file)), json.loads(json.dumps(told))
+            changed = sorted(key for key in before if key not in now or before[key] != now[key])
             if changed:
                 raise ValueError(
                     f"{self.path} holds a run with another {', '.join(changed)}. "
@@ -44,7 +51,18 @@ class RunFolder:
                 )
             return
         self.path.mkdir(parents=True, exist_ok=True)
-        _replace(file, (json.dumps(settings, indent=2) + "\n").encode())
+        for name, text in (files or {}).items():
+            _replace(self.path / name, text.encode())
+        _replace(file, (json.dumps(told, indent=2) + "\n").encode())
+
+    def write_start(self, about: dict[str, Any]) -> None:
+        """Append one line about this start of the run."""
+        with (self.path / STARTS_FILE).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(about) + "\n")
+
+    def write_summary(self, summary: dict[str, Any]) -> None:
+        """Store how the run ended."""
+        _replace(self.path / SUMMARY_FILE, (json.dumps(summary, indent=2) + "\n").encode())
 
     def log(self, record: dict[str, float]) -> None:
         """Append one line of metrics."""
@@ -67,59 +85,24 @@ class RunFolder:
         kept = [record for record in self.records() if record["step"] <= step]
         _replace(self.path / LOG_FILE, "".join(json.dumps(record) + "\n" for record in kept).encode())
 
-    def save_checkpoint(
-        self, model: nn.Module, optimizer: torch.optim.Optimizer, step: int, best: float | None
-    ) -> None:
-        """Write model (buffers and codebook averages included), optimiser and counters."""
-        tensors = {f"model.{name}": value.contiguous() for name, value in model.state_dict().items()}
-        for index, state in optimizer.state_dict()["state"].items():
-            tensors |= {f"optimizer.{index}.{name}": value.contiguous() for name, value in state.items()}
-        temporary = self.path / (CHECKPOINT_FILE + ".tmp")
-        save_file(tensors, temporary, metadata={"progress": json.dumps({"step": step, "best": best})})
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
-        temporary.replace(self.path / CHECKPOINT_FILE)
 
-    def load_checkpoint(self, model: nn.Module, optimizer: torch.optim.Optimizer) -> tuple[int, float | None]:
-        """Put the state back; returns the number of steps done and the best validation value.
-
-        Raises:
-            ValueError: If the checkpoint is damaged or belongs to another network.
-        """
-        file = self.path / CHECKPOINT_FILE
-        try:
-            with safe_open(file, framework="pt") as tensors:
-                progress = json.loads(tensors.metadata()["progress"])
-                state = {name: tensors.get_tensor(name) for name in tensors.keys()}  # noqa: SIM118
-            model.load_state_dict(
-                {
-                    name.removeprefix("model."): value
-                    for name, value in state.items()
-                    if name.startswith("model.")
-                }
-            )
-        except (SafetensorError, RuntimeError, KeyError, TypeError) as error:
-            reason = " ".join(str(error).split())
-            raise ValueError(f"{file} is damaged or belongs to another network: {reason}") from error
-        _load_optimizer(optimizer, {n: v for n, v in state.items() if n.startswith("optimizer.")})
-        return progress["step"], progress["best"]
+def _with_default_settings(told: dict[str, Any]) -> dict[str, Any]:
+    stored = told.get(_SETTINGS, {})
+    defaults = {
+        field.name: field.default
+        for field in dataclasses.fields(TrainingSettings)
+        if field.default is not dataclasses.MISSING
+    }
+    merged = json.loads(json.dumps({**defaults, **stored}))
+    return {**told, _SETTINGS: merged} if stored else told
 
 
-def _read_settings(file: Path) -> dict[str, Any]:
+def _read_json(file: Path) -> dict[str, Any]:
     try:
-        settings: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        content: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
     except json.JSONDecodeError as error:
         raise ValueError(f"{file} is damaged ({error}). Restore it or choose another folder.") from error
-    return settings
-
-
-def _load_optimizer(optimizer: torch.optim.Optimizer, tensors: dict[str, torch.Tensor]) -> None:
-    packed = optimizer.state_dict()
-    packed["state"] = {}
-    for name, value in tensors.items():
-        _, index, key = name.split(".")
-        packed["state"].setdefault(int(index), {})[key] = value
-    optimizer.load_state_dict(packed)
+    return content
 
 
 def _replace(path: Path, content: bytes) -> None:

@@ -17,7 +17,7 @@ from controlmm.models.tokenizer import MotionTokenizer
 from controlmm.motion.layout import feature_layout
 from controlmm.motion.normalizer import ROOT_CONTACT_BIAS, Normalizer
 from controlmm.ops import recover_joints
-from controlmm.training.loop import Recipe
+from controlmm.training.recipe import Recipe
 from controlmm.training.settings import TrainingSettings
 from controlmm.training.stage import Stage, StageInputs, by_size, fit_normalizer
 from controlmm.training.windows import WindowSampler

@@ -21,7 +21,7 @@ from controlmm.models.rvq_vae import RvqVae, RvqVaeConfig, frame_mask
 from controlmm.motion.layout import feature_layout
 from controlmm.motion.normalizer import Normalizer
 from controlmm.ops import recover_joints
-from controlmm.training.loop import Recipe
+from controlmm.training.recipe import Recipe
 from controlmm.training.rvq import POSITION_WEIGHT, reconstruction_errors
 from controlmm.training.settings import TrainingSettings
 from controlmm.training.stage import NORMALIZER_FILE, Stage, StageInputs, best_weights, by_size

@@ -11,7 +11,8 @@ class TrainingSettings:
     """Everything about a run but the network and the data."""
 
     steps: int  # optimiser steps
-    batch_size: int
+    batch_size: int  # clips or windows in a shard
+    shards: int = 1  # a step's batch is this many times `batch_size`; processes share the shards
     learning_rate: float = 2e-4
     warmup: int = 2000  # steps of linear warm-up
     milestones: tuple[int, ...] = ()  # steps at which the rate falls by `gamma`; empty: cosine decay to 1 %
@@ -22,11 +23,19 @@ class TrainingSettings:
     bf16: bool = True  # autocast; float32 master weights
     validate_every: int = 500
     checkpoint_every: int = 250
+    average_decay: float = 0.0  # of the weights' moving average, which is then validated and kept; 0: none
+    patience: int = 0  # validations without a better score after which the run ends; 0: never
     seed: int = 3407
 
     def __post_init__(self) -> None:
-        if self.steps < 1 or self.batch_size < 1 or self.validate_every < 1 or self.checkpoint_every < 1:
-            raise ValueError(f"`steps`, `batch_size` and the intervals must be at least 1, got {self}.")
+        if min(self.steps, self.batch_size, self.shards, self.validate_every, self.checkpoint_every) < 1:
+            raise ValueError(
+                f"`steps`, `batch_size`, `shards` and the intervals must be at least 1, got {self}."
+            )
+        if self.patience < 0:
+            raise ValueError(f"`patience` must be 0 (never) or a number of validations, got {self.patience}.")
+        if not 0 <= self.average_decay < 1:
+            raise ValueError(f"`average_decay` must be in [0, 1), such as 0.999, got {self.average_decay}.")
         if not self.learning_rate > 0:
             raise ValueError(f"`learning_rate` must be positive, got {self.learning_rate}.")
 

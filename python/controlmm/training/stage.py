@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from controlmm.models.rvq_vae import RvqVae
 from controlmm.models.tokenizer import MotionTokenizer
 from controlmm.motion.normalizer import ROOT_CONTACT_BIAS, Normalizer
 from controlmm.text import TextEncoder, encode_all
-from controlmm.training.loop import Recipe
+from controlmm.training.recipe import Recipe
 from controlmm.training.settings import TrainingSettings
 from controlmm.training.tokens import MIN_FRAMES, TokenSampler
 
@@ -32,17 +33,31 @@ class StageInputs:
 
     root: Path  # of all stages of one model
     folder: MotionFolder
-    train_clips: Sequence[FeatureClip]
-    val_clips: Sequence[FeatureClip]
     text_encoder: TextEncoder | None = None  # set for stages that use text
     options: Any = None  # the stage's own, see `Stage.options`
     progress: bool = True
+    writes: bool = True  # whether this process may write into the root; one of those that train together may
+
+    @cached_property
+    def train_clips(self) -> list[FeatureClip]:
+        """The clips of the training split."""
+        return list(self.folder.clips("train", progress=self.progress))
+
+    @cached_property
+    def val_clips(self) -> list[FeatureClip]:
+        """The clips of the validation split."""
+        return list(self.folder.clips("val", progress=self.progress))
+
+    @property
+    def splits(self) -> dict[str, list[FeatureClip]]:
+        """Both, by name."""
+        return {"train": self.train_clips, "val": self.val_clips}
 
     def text_features(self) -> dict[str, Float[Tensor, "E"]]:
         """The text encoder's pooled vector of every caption; cached beside the data."""
         assert self.text_encoder is not None  # `train_stage` asks for it
-        splits = (self.train_clips, self.val_clips)
-        texts = sorted({caption.text for clips in splits for clip in clips for caption in clip.captions})
+        clips = self.train_clips + self.val_clips
+        texts = sorted({caption.text for clip in clips for caption in clip.captions})
         cache = self.folder.path / f"text_{self.text_encoder.name}.safetensors"
         features = encode_all(texts, self.text_encoder, cache, progress=self.progress)
         return dict(zip(texts, features, strict=True))
@@ -109,8 +124,9 @@ def fit_normalizer(inputs: StageInputs, *, root_contact_bias: float = ROOT_CONTA
     normalizer = Normalizer.fit(
         (clip.features for clip in inputs.train_clips), root_contact_bias=root_contact_bias
     )
-    inputs.root.mkdir(parents=True, exist_ok=True)
-    normalizer.save(inputs.root / NORMALIZER_FILE)
+    if inputs.writes:
+        inputs.root.mkdir(parents=True, exist_ok=True)
+        normalizer.save(inputs.root / NORMALIZER_FILE)
     return normalizer
 
 

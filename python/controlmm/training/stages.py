@@ -2,23 +2,35 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from controlmm.data.clip import FeatureClip
 from controlmm.data.folder import MotionFolder
 from controlmm.nn.checkpoint import CONFIG_FILE, WEIGHTS_FILE, read_config
 from controlmm.text import TextEncoder
 from controlmm.training.changes import with_changes
-from controlmm.training.loop import Recipe, train
+from controlmm.training.loop import train
+from controlmm.training.processes import Processes
+from controlmm.training.provenance import clip_table, data_identity, file_hash
+from controlmm.training.recipe import Recipe, Sample, ShowsSamples
 from controlmm.training.registry import load_stage
 from controlmm.training.stage import Stage, StageInputs, best_weights
 from controlmm.training.starting import adopt_earlier_stages, load_starting_weights, starting_folder
+
+CLIPS_FILE = "clips.tsv"  # in the run folder: which clips it saw
+
+
+@dataclass(frozen=True)
+class Validation:
+    """A moment of a run for people to look at: the network still has the weights that were validated."""
+
+    run: Path
+    step: int
+    samples: Callable[[], Sequence[Sample]]  # what the network makes of a few validation clips
 
 
 def train_stage(
@@ -32,6 +44,9 @@ def train_stage(
     options: Mapping[str, str] | None = None,
     start_from: str | Path | None = None,
     progress: bool = True,
+    on_validation: Callable[[Validation], None] | None = None,
+    processes: Processes | None = None,
+    device: str | torch.device = "cpu",
 ) -> Path:
     """Train one stage into ``root/<name>`` or go on where it was stopped. Returns the run folder.
 
@@ -48,82 +63,80 @@ def train_stage(
             also lends the earlier stages that ``root`` lacks (they are copied there). The network keeps its
             configuration; ``size`` then only names the settings.
         progress: Show progress bars.
+        on_validation: Called after each validation, in the first process only.
+        processes: Those that train together; by default this one alone.
+        device: Where the network is trained, such as ``cpu`` or ``cuda``.
 
     Raises:
         FileNotFoundError: If the data or an earlier stage is missing.
         ValueError: If a name is unknown, the data is unusable, or ``root/<name>`` holds another run.
     """
     stage, root = load_stage(name), Path(root)
-    config, settings = _of_size(stage, size)
-    settings = replace(settings, **(changes or {}))
-    folder = MotionFolder(data)
-    start = None
+    if size not in stage.configs or size not in stage.settings:
+        raise ValueError(f"Stage {name!r} has no size {size!r}. Sizes: {', '.join(stage.configs)}.")
+    settings = replace(stage.settings[size], **(changes or {}))
+    team = processes or Processes()
+    config, start = stage.configs[size], None
     if start_from is not None:
         start = starting_folder(Path(start_from), stage)
-        adopt_earlier_stages(Path(start_from), root, stage)
         config = read_config(start / CONFIG_FILE, type(config))
     parts = with_changes({"config": config, "options": stage.options}, options or {})
-    config = parts["config"]
-    for need in stage.needs:
-        best_weights(root, need)
-    if stage.uses_text and text_encoder is None:
-        raise ValueError(f"`text_encoder` is needed to train {name!r}.")
     inputs = StageInputs(
         root,
-        folder,
-        train_clips=list(folder.clips("train", progress=progress)),
-        val_clips=list(folder.clips("val", progress=progress)),
+        MotionFolder(data),
         text_encoder=text_encoder,
         options=parts["options"],
         progress=progress,
+        writes=team.is_first,
     )
-    torch.manual_seed(settings.seed)  # fresh weights are a function of the seed
-    recipe = stage.build(config, inputs)
-    if start is not None:
-        load_starting_weights(recipe.model, start)
-    train(_Described(recipe, size, inputs, start, options or {}), settings, root / name, progress=progress)
+    with team.first_goes_ahead():
+        if start_from is not None and team.is_first:
+            adopt_earlier_stages(Path(start_from), root, stage)
+        recipe, built_on = _built(stage, parts["config"], settings.seed, inputs, start)
+    about: dict[str, Any] = {"size": size, "built_on": built_on, **data_identity(inputs.splits)}
+    if options:
+        about["options"] = dict(options)
+
+    def observe(step: int) -> None:
+        if on_validation is not None:
+            samples = recipe.samples if isinstance(recipe, ShowsSamples) else list
+            on_validation(Validation(root / name, step, samples))
+
+    train(
+        _Described(recipe, about),
+        settings,
+        root / name,
+        progress=progress,
+        on_validation=observe,
+        files={CLIPS_FILE: clip_table(inputs.splits)},
+        processes=team,
+        device=device,
+    )
     return root / name
 
 
-def _of_size(stage: Stage, size: str) -> tuple[Any, Any]:
-    if size not in stage.configs or size not in stage.settings:
-        raise ValueError(f"Stage {stage.name!r} has no size {size!r}. Sizes: {', '.join(stage.configs)}.")
-    return stage.configs[size], stage.settings[size]
+def _built(
+    stage: Stage, config: Any, seed: int, inputs: StageInputs, start: Path | None
+) -> tuple[Recipe, dict[str, str]]:
+    """The stage's recipe, and the hashes of the weights that it stands on."""
+    folders = {need: best_weights(inputs.root, need) for need in stage.needs}
+    if start is not None:
+        folders["start_from"] = start
+    if stage.uses_text and inputs.text_encoder is None:
+        raise ValueError(f"`text_encoder` is needed to train {stage.name!r}.")
+    torch.manual_seed(seed)  # fresh weights are a function of the seed
+    recipe = stage.build(config, inputs)
+    if start is not None:
+        load_starting_weights(recipe.model, start)
+    return recipe, {name: file_hash(folder / WEIGHTS_FILE) for name, folder in folders.items()}
 
 
 class _Described:
-    """A recipe that also says which clips it was given, so that a run names its data."""
+    """A recipe that also says which clips it was given and what it stands on."""
 
-    def __init__(
-        self, recipe: Recipe, size: str, inputs: StageInputs, start: Path | None, options: Mapping[str, str]
-    ) -> None:
-        self._recipe, self._size = recipe, size
-        self._start = {} if start is None else {"start_from_sha256": _file_hash(start / WEIGHTS_FILE)}
-        self._options = {"options": dict(options)} if options else {}
-        self._data = {
-            name: {"clips": len(clips), "sha256": _hash(clips)}
-            for name, clips in (("train", inputs.train_clips), ("val", inputs.val_clips))
-        }
+    def __init__(self, recipe: Recipe, about: dict[str, Any]) -> None:
+        self._recipe, self._about = recipe, about
         self.model, self.loss, self.validate = recipe.model, recipe.loss, recipe.validate
 
     def describe(self) -> dict[str, Any]:
-        return {
-            **self._recipe.describe(),
-            "size": self._size,
-            **self._options,
-            **self._start,
-            "data": self._data,
-        }
-
-
-def _file_hash(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _hash(clips: Sequence[FeatureClip]) -> str:
-    digest = hashlib.sha256()
-    for clip in clips:
-        digest.update(clip.id.encode())
-        digest.update(clip.features.numpy().tobytes())
-    return digest.hexdigest()
+        return {**self._recipe.describe(), **self._about}
