@@ -14,7 +14,7 @@ from torch.nn.functional import cross_entropy
 from controlmm.data.clip import FeatureClip
 from controlmm.models.length_estimator import LengthEstimator, LengthEstimatorConfig
 from controlmm.motion.skeleton import skeleton_of_width
-from controlmm.training.loop import Recipe
+from controlmm.training.recipe import Recipe
 from controlmm.training.settings import TrainingSettings
 from controlmm.training.stage import Stage, StageInputs, by_size
 from controlmm.training.tokens import MAX_FRAMES, MIN_FRAMES

@@ -19,7 +19,7 @@ from controlmm.nn.part_quantizer import PartQuantizer
 from controlmm.nn.trunk import drop_text
 from controlmm.ops import gumbel_straight_through, recover_joints
 from controlmm.training import masked
-from controlmm.training.loop import Recipe
+from controlmm.training.recipe import Recipe
 from controlmm.training.settings import TrainingSettings
 from controlmm.training.stage import NORMALIZER_FILE, Stage, StageInputs, best_weights, by_size
 from controlmm.training.tokens import TokenBatch, TokenSampler

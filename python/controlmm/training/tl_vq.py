@@ -15,7 +15,7 @@ from controlmm.motion.layout import feature_layout
 from controlmm.motion.normalizer import Normalizer
 from controlmm.ops import recover_joints
 from controlmm.training import rvq
-from controlmm.training.loop import Recipe
+from controlmm.training.recipe import Recipe
 from controlmm.training.rvq import reconstruction_errors
 from controlmm.training.settings import TrainingSettings
 from controlmm.training.stage import Stage, StageInputs, by_size, fit_normalizer
