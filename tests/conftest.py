@@ -12,6 +12,7 @@ import torch
 from controlmm.data import Caption, Clip, write_folder
 from controlmm.models.control_branch import ControlBranch, ControlBranchConfig
 from controlmm.models.masked_transformer import MaskedTransformer, MaskedTransformerConfig
+from controlmm.models.motion_text_matcher import MatcherConfig, MotionTextMatcher
 from controlmm.models.residual_transformer import ResidualTransformer, ResidualTransformerConfig
 from controlmm.models.rvq_vae import RvqVae, RvqVaeConfig
 from controlmm.motion.features import canonicalize, joints_to_features
@@ -161,4 +162,16 @@ def tiny_data_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for index, turn in enumerate(all_turns)
     ]
     write_folder(clips, folder, progress=False)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def tiny_evaluator_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An untrained in-project evaluator of tiny size, with the statistics of synthetic walks."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(9)
+        config = MatcherConfig.tiny().for_data(HUMANML3D.feature_dim, HashingTextEncoder(64).config())
+        matcher = MotionTextMatcher(config, synthetic_normalizer())
+    folder = tmp_path_factory.mktemp("evaluator")
+    matcher.save_pretrained(folder)
     return folder

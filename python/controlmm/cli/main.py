@@ -15,6 +15,7 @@ from controlmm.cli.assemble import assemble
 from controlmm.cli.controls import controls_app
 from controlmm.cli.convert import convert
 from controlmm.cli.convert_evaluator import convert_evaluator
+from controlmm.cli.evaluate import evaluate
 from controlmm.cli.generate import generate
 from controlmm.cli.info import info
 from controlmm.cli.plot import plot
@@ -48,7 +49,7 @@ def _options(
     """Text plus 3D control in, human motion out."""
 
 
-for _command in (generate, info, prepare, train, plot, assemble, convert, convert_evaluator):
+for _command in (generate, info, prepare, train, plot, assemble, convert, convert_evaluator, evaluate):
     app.command()(_command)
 app.add_typer(controls_app, name="controls")
 

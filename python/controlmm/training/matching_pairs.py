@@ -16,7 +16,6 @@ from controlmm.training.windows import source_weights
 
 MIN_FRAMES, MAX_FRAMES, UNIT = 24, 196, 4
 _SAME_MEANING = 0.75  # cosine of two sentences' features above which they may describe one motion
-_LENGTH_BAND = 0.15  # the clips of a batch differ from one of them in length by at most this share
 _SIDES = re.compile(r"\b(left|right|clockwise|counter-?clockwise|anti-?clockwise)")
 
 
@@ -72,20 +71,13 @@ class PairSampler:
             for name, clip in usable.items()
         ]
         self._weights = source_weights([clip.source for clip in usable.values()], [1] * len(usable))
-        self._frames = torch.tensor([min(len(item.features), MAX_FRAMES) for item in self._items])
 
     def __len__(self) -> int:
         return len(self._items)
 
     def sample(self, count: int) -> PairBatch:
-        """At most ``count`` pairs of about one length, half of them mirrored twins of the others.
-
-        Equal lengths spend little on padding, and no motion is told from the others by its length. Uses
-        torch's global random state.
-        """
-        first = self._frames[torch.multinomial(self._weights, 1)]
-        is_near = (self._frames - first).abs() <= _LENGTH_BAND * first
-        drawn = torch.multinomial(self._weights * is_near, (count + 1) // 2, replacement=True).tolist()
+        """At most ``count`` pairs, half of them mirrored twins of the others, from torch's random state."""
+        drawn = torch.multinomial(self._weights, (count + 1) // 2, replacement=True).tolist()
         twins = [self._items[index].twin for index in drawn]
         chosen = list(dict.fromkeys([*drawn, *(twin for twin in twins if twin is not None)]))
         return self.batch(chosen[:count])

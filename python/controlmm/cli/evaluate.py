@@ -1,0 +1,121 @@
+"""``controlmm evaluate``: the papers' protocol on a model, or on several side by side."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from controlmm.evaluation.protocol import Protocol, Row
+    from controlmm.evaluation.test_set import TestSet
+    from controlmm.pipelines.pipeline import MotionPipeline
+
+KINDS = "annotator,written,kinematic"
+
+
+def evaluate(
+    data: Annotated[Path, typer.Option(help="HumanML3D / KIT-ML folder, or a folder of npz packs.")],
+    out: Annotated[Path, typer.Option(help="Folder for results; the same command goes on in it.")],
+    model: Annotated[
+        list[Path] | None,
+        typer.Option(help="Model folder; again for more. By default the model that comes with the package."),
+    ] = None,
+    control: Annotated[str, typer.Option(help="A joint, or random, cross, lower, all, none.")] = "pelvis",
+    density: Annotated[
+        str, typer.Option(help="Keyframes: 1, 2, 5, 49, 196, or all (drawn for each clip).")
+    ] = "all",
+    preset: Annotated[list[str] | None, typer.Option(help="Preset; again for more.")] = None,
+    repeats: Annotated[int, typer.Option(help="Times, each with other draws.")] = 1,
+    limit: Annotated[
+        int | None, typer.Option(help="Clips a repeat; in whole batches of 32.", show_default="all")
+    ] = None,
+    split: Annotated[str, typer.Option(help="train, val, test; all for every clip.")] = "test",
+    captions: Annotated[str, typer.Option(help="Kinds of captions, comma-separated.")] = KINDS,
+    sources: Annotated[
+        str | None, typer.Option(help="Sources of clips, comma-separated.", show_default="all")
+    ] = None,
+    evaluator: Annotated[
+        Path | None, typer.Option(help="Evaluator folder.", show_default="the one in the package")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of all draws.")] = 0,
+    mask_padding: Annotated[
+        bool, typer.Option("--mask-padding", help="Hide decoded padding from the published evaluator.")
+    ] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
+) -> None:
+    """Measure quality, control and time; real motion is the first row of every table."""
+    from controlmm.evaluation.control_draws import ControlSetting
+    from controlmm.evaluation.evaluators import load_evaluator
+    from controlmm.evaluation.protocol import Protocol, evaluate_rows
+    from controlmm.evaluation.report import ResultPage
+    from controlmm.evaluation.test_set import read_test_set
+
+    started = time.perf_counter()
+    setting = ControlSetting(control, int(density) if density.isdigit() else density)
+    protocol = Protocol(repeats, limit, seed, mask_padding)
+    judge = load_evaluator(evaluator)
+    test_set = read_test_set(
+        data, split=split, kinds=_listed(captions), sources=_listed(sources) if sources else None
+    )
+    setting.check(test_set.skeleton)
+    rows = _rows([Path(m) for m in model] if model else [None], preset or ["balanced"], setting)
+    scores = evaluate_rows(rows, test_set, judge, protocol, out, progress=not quiet)
+    facts = _facts(test_set, protocol, seconds=time.perf_counter() - started)
+    page = ResultPage(f"Control of {control}, density {density}", facts, scores, judge.caution)
+    page.write(out)
+    typer.echo(page.markdown())
+
+
+def command_line() -> str:
+    """The command as it was typed."""
+    return shlex.join(["controlmm", *sys.argv[1:]])
+
+
+def _rows(models: list[Path | None], presets: list[str], setting: object) -> list[Row]:
+    from controlmm.evaluation.control_draws import ControlSetting
+    from controlmm.evaluation.motion_sources import Generated, RealMotion, Reconstruction
+    from controlmm.evaluation.protocol import Row
+    from controlmm.pipelines.presets import resolve_preset
+
+    assert isinstance(setting, ControlSetting)
+    plans = {name: resolve_preset(name) for name in presets}
+    rows = [Row("real motion", RealMotion(), setting)]
+    for path in models:
+        pipeline = load_pipeline(path)
+        name = pipeline.kind if path is None else path.name
+        rows.append(Row(f"{name}, reconstruction", Reconstruction(pipeline), setting))
+        rows += [Row(f"{name}, {plan}", Generated(pipeline, plans[plan]), setting) for plan in plans]
+    return rows
+
+
+def load_pipeline(path: Path | None) -> MotionPipeline:
+    """The pipeline in a model folder, of whatever kind it is."""
+    from controlmm.pipelines import ControlMM
+
+    return ControlMM.from_pretrained(path)
+
+
+def _facts(test_set: TestSet, protocol: Protocol, *, seconds: float) -> dict[str, object]:
+    from controlmm.evaluation.machine import machine, revision
+
+    sources = ", ".join(f"{name} {count}" for name, count in sorted(test_set.sources.items()))
+    clips = protocol.clips(len(test_set.items))
+    return {
+        "command": f"`{command_line()}`",
+        "revision": revision(),
+        "machine": machine(),
+        "seconds of this call": round(seconds, 1),
+        "clips": f"{clips} a repeat of {len(test_set.items)} in the split {test_set.split} ({sources})",
+        "captions": ", ".join(test_set.kinds),
+        "repeats": protocol.repeats,
+        "seed": protocol.seed,
+    }
+
+
+def _listed(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",") if name.strip()]

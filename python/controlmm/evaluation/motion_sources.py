@@ -1,0 +1,150 @@
+"""Where evaluated motions come from: recordings, a tokenizer's reconstruction, a pipeline."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Protocol
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from controlmm.evaluation.random_streams import stream_seed
+from controlmm.evaluation.test_set import MAX_FRAMES, Sample
+from controlmm.models.rvq_vae import frame_mask
+from controlmm.ops import recover_joints
+from controlmm.pipelines.pipeline import MotionPipeline
+from controlmm.pipelines.presets import Preset
+from controlmm.text.encoder import weights_sha256
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """Samples of one repeat with their targets.
+
+    Attributes:
+        samples: ``B`` of them.
+        real: (B, 196, D) recorded features, de-normalised, zero in padding.
+        joints: (B, 196, J, 3) recorded joints in the skeleton's unit.
+        mask: (B, 196, J) what is controlled; the targets are ``joints`` there.
+        noise_seeds: One a sample, for the generation.
+    """
+
+    samples: Sequence[Sample]
+    real: Float[Tensor, "B T D"]
+    joints: Float[Tensor, "B T J 3"]
+    mask: Bool[Tensor, "B T J"]
+    noise_seeds: Sequence[int]
+
+    @classmethod
+    def of(cls, samples: Sequence[Sample], masks: Sequence[Tensor], *, seed: int, repeat: int) -> Batch:
+        """Pad the samples to 196 frames and decode their joints."""
+        real = padded_features(samples)
+        joints = recover_joints(real, joints=masks[0].shape[1])
+        seeds = [stream_seed(seed, repeat, sample.id, "noise") for sample in samples]
+        return cls(samples, real, joints, torch.stack(list(masks)), seeds)
+
+    @property
+    def lengths(self) -> Int[Tensor, "B"]:
+        """Frames of each sample."""
+        return torch.tensor([sample.length for sample in self.samples])
+
+
+def padded_features(samples: Sequence[Sample]) -> Float[Tensor, "B 196 D"]:
+    """The samples' features with zeros up to 196 frames."""
+    padded = torch.zeros(len(samples), MAX_FRAMES, samples[0].features.shape[1])
+    for row, sample in zip(padded, samples, strict=True):
+        row[: sample.length] = sample.features
+    return padded
+
+
+@dataclass(frozen=True, eq=False)
+class Produced:
+    """Features of a batch and the seconds that they took.
+
+    ``features`` are (B, 196, D), de-normalised; ``has_padding`` says that a decoder wrote what lies beyond
+    the clips, which the published evaluation looks at.
+    """
+
+    features: Float[Tensor, "B T D"]
+    seconds: float
+    has_padding: bool
+
+
+class MotionSource(Protocol):
+    """A row of a table."""
+
+    def describe(self) -> dict[str, Any]:
+        """What identifies it, JSON-able: weights, preset."""
+
+    def motions(self, batch: Batch) -> Produced:
+        """Motions for the texts, lengths and targets of ``batch``."""
+
+
+class RealMotion:
+    """The recordings themselves."""
+
+    def describe(self) -> dict[str, Any]:
+        """See :class:`MotionSource`."""
+        return {"source": "real"}
+
+    def motions(self, batch: Batch) -> Produced:
+        """See :class:`MotionSource`."""
+        return Produced(batch.real, 0.0, has_padding=False)
+
+
+class Reconstruction:
+    """Recordings after the pipeline's tokenizer: what generation can reach at best."""
+
+    def __init__(self, pipeline: MotionPipeline) -> None:
+        self._decoder = pipeline.decoder
+
+    def describe(self) -> dict[str, Any]:
+        """See :class:`MotionSource`."""
+        return {"source": "reconstruction", "tokenizer": weights_sha256(self._decoder.tokenizer)}
+
+    @torch.no_grad()
+    def motions(self, batch: Batch) -> Produced:
+        """See :class:`MotionSource`."""
+        started = time.perf_counter()
+        normalizer, tokenizer = self._decoder.normalizer, self._decoder.tokenizer
+        frames = frame_mask(batch.lengths, MAX_FRAMES)
+        normalized = normalizer.normalize(batch.real) * frames[..., None]
+        latents = tokenizer.quantizer.lookup(tokenizer.encode(normalized, frames))
+        features = self._decoder.features(latents, frames)
+        return Produced(features, time.perf_counter() - started, has_padding=False)
+
+
+class Generated:
+    """A pipeline's motions under one preset."""
+
+    def __init__(self, pipeline: MotionPipeline, preset: Preset) -> None:
+        self.pipeline, self.preset = pipeline, preset
+
+    def describe(self) -> dict[str, Any]:
+        """See :class:`MotionSource`."""
+        networks = {name: weights_sha256(network) for name, network in self.pipeline.networks().items()}
+        return {"source": self.pipeline.kind, "networks": networks, "preset": asdict(self.preset)}
+
+    @torch.no_grad()
+    def motions(self, batch: Batch) -> Produced:
+        """See :class:`MotionSource`. Seconds are those of text features, latents and decoding."""
+        started = time.perf_counter()
+        pipeline, frames = self.pipeline, frame_mask(batch.lengths, MAX_FRAMES)
+        latents = pipeline.generate_latents(
+            pipeline.text_encoder.encode([sample.caption.text for sample in batch.samples]).pooled,
+            lengths=batch.lengths.tolist(),
+            targets=batch.joints,
+            mask=batch.mask[..., None].expand_as(batch.joints),
+            seeds=batch.noise_seeds,
+            preset=self.preset,
+        )
+        tokens = MAX_FRAMES // pipeline.decoder.downsample
+        latents = torch.nn.functional.pad(latents, (0, 0, 0, tokens - latents.shape[1]))
+        features = pipeline.decoder.features(latents, frames)
+        seconds = time.perf_counter() - started
+        # Beyond the clips: what the decoder makes of empty tokens, as in the published evaluation.
+        padding = pipeline.decoder.features(latents)
+        return Produced(features.where(frames[..., None], padding), seconds, has_padding=True)

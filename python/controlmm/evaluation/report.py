@@ -1,0 +1,116 @@
+"""Results as Markdown for people and as JSON for programs."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from controlmm.evaluation.intervals import Interval
+from controlmm.evaluation.scores import RowScores
+
+RESULTS_MARKDOWN, RESULTS_JSON = "results.md", "results.json"
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table: its title, the metric it shows and how."""
+
+    title: str
+    metric: str
+    digits: int = 3
+    factor: float = 1.0
+
+    def cell(self, row: RowScores) -> str:
+        """The metric of a row, or ``–`` where it does not apply."""
+        found = row[self.metric] if self.metric in row.repeats else Interval(math.nan, 0.0)
+        if math.isnan(found.mean):
+            return "–"  # noqa: RUF001 (the papers' tables have it)
+        return Interval(self.factor * found.mean, self.factor * found.half_width).shown(self.digits)
+
+
+QUALITY = (
+    Column("R@1 ↑", "r1"),
+    Column("R@2 ↑", "r2"),
+    Column("R@3 ↑", "r3"),
+    Column("FID ↓", "fid"),
+    Column("MM-Dist ↓", "mm_distance"),
+    Column("Diversity →", "diversity"),
+)
+CONTROL = (
+    Column("R@3 ↑", "r3"),
+    Column("FID ↓", "fid"),
+    Column("Diversity →", "diversity"),
+    Column("Skating ↓", "skating_published", 4),
+    Column("Traj. err. 50 cm ↓", "trajectory_50_joint", 4),
+    Column("Loc. err. 50 cm ↓", "location_50_joint", 4),
+    Column("Avg. err. (m) ↓", "average_joint", 4),
+    Column("s a clip", "seconds", 2),
+)
+MORE_CONTROL = (
+    Column("Traj. 20 cm", "trajectory_20_joint", 4),
+    Column("Loc. 20 cm", "location_20_joint", 4),
+    Column("Traj. 50 cm by frame", "trajectory_50_frame", 4),
+    Column("Loc. 50 cm by frame", "location_50_frame", 4),
+    Column("Avg. by frame (m)", "average_frame", 4),
+)
+PHYSICS = (
+    Column("Skating, masked", "skating", 4),
+    Column("Below floor (cm)", "penetration", 2, 100.0),
+    Column("Jerk (m/s³)", "jerk", 1),
+    Column("Bone deviation (mm)", "bone_deviation", 2, 1000.0),
+    Column("Contacts right", "contact_consistency", 3),
+    Column("To recording, root aligned (cm)", "distance_to_real", 1, 100.0),
+    Column("FID of two halves", "fid_halves"),
+)
+
+
+@dataclass(frozen=True)
+class ResultPage:
+    """One evaluation: what was run, and its rows.
+
+    Attributes:
+        title: Heading.
+        facts: What must be said beside the numbers: command, revision, machine, seconds, data, captions.
+        rows: Scores.
+        caution: A sentence at the foot.
+    """
+
+    title: str
+    facts: Mapping[str, Any]
+    rows: Sequence[RowScores]
+    caution: str
+
+    def write(self, out: Path) -> None:
+        """Write ``results.md`` and ``results.json`` into ``out``."""
+        (out / RESULTS_MARKDOWN).write_text(self.markdown(), encoding="utf-8")
+        content = {"title": self.title, **self.facts, "caution": self.caution}
+        content["rows"] = [row.as_json() for row in self.rows]
+        (out / RESULTS_JSON).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+    def markdown(self) -> str:
+        """The page with all tables."""
+        facts = "\n".join(f"- {name}: {value}" for name, value in self.facts.items())
+        tables = [
+            f"## {heading}\n\n{markdown_table(self.rows, columns)}"
+            for heading, columns in (
+                ("Text", QUALITY), ("Control", CONTROL), ("Control, other counts", MORE_CONTROL),
+                ("Motion", PHYSICS),
+            )
+        ]  # fmt: skip
+        return "\n\n".join([f"# {self.title}", facts, *tables, self.caution]) + "\n"
+
+
+def markdown_table(rows: Sequence[RowScores], columns: Sequence[Column]) -> str:
+    """A pipe table, a line a row."""
+    cells = [[row.label, *(column.cell(row) for column in columns)] for row in rows]
+    return pipe_table(["", *(column.title for column in columns)], cells)
+
+
+def pipe_table(titles: Sequence[str], cells: Sequence[Sequence[str]]) -> str:
+    """Markdown of a table with the first column to the left and the others to the right."""
+    rule = ["---", *["---:"] * (len(titles) - 1)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in (titles, rule, *cells))
