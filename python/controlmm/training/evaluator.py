@@ -21,7 +21,7 @@ SETTINGS = {
         steps=100_000, batch_size=128, learning_rate=2e-4, weight_decay=0.01, bf16=False
     ),
     "small": TrainingSettings(
-        steps=1200, batch_size=96, learning_rate=1e-3, warmup=100, weight_decay=0.05, validate_every=100
+        steps=600, batch_size=96, learning_rate=1e-3, warmup=60, weight_decay=0.05, validate_every=100
     ),
     "tiny": TrainingSettings(
         steps=20,
