@@ -12,10 +12,11 @@ from controlmm.models.trajectory_transformer import TrajectoryTransformer, Traje
 from controlmm.motion.normalizer import Normalizer
 from controlmm.ops import gumbel_noise, recover_joints
 from controlmm.text.hashing import HashingTextEncoder
-from controlmm.training import loop, tl_mtt, tl_vq
+from controlmm.training import tl_mtt, tl_vq
 from controlmm.training.registry import TLCONTROL_STAGES
 from controlmm.training.run_folder import RunFolder
 from controlmm.training.stages import train_stage
+from controlmm.training.step import StepTaker
 from controlmm.training.tokens import TokenSampler
 
 QUICK = {"steps": 10, "validate_every": 5}
@@ -72,17 +73,17 @@ def test_a_killed_and_resumed_run_equals_the_unbroken_one_bit_by_bit(
 ):
     (tmp_path / "normalizer.safetensors").symlink_to(trained / "normalizer.safetensors")
     (tmp_path / "tl-vq").symlink_to(trained / "tl-vq")
-    take_step = loop._take_step
+    take = StepTaker.take
 
-    def killed_at_eight(recipe, settings, optimizer, parameters, step):
+    def killed_at_eight(self, step):
         if step == 7:
             raise KilledError
-        return take_step(recipe, settings, optimizer, parameters, step)
+        return take(self, step)
 
-    monkeypatch.setattr(loop, "_take_step", killed_at_eight)
+    monkeypatch.setattr(StepTaker, "take", killed_at_eight)
     with pytest.raises(KilledError):
         train("tl-mtt", tiny_data_folder, tmp_path)
-    monkeypatch.setattr(loop, "_take_step", take_step)
+    monkeypatch.setattr(StepTaker, "take", take)
     train("tl-mtt", tiny_data_folder, tmp_path)
     expected = load_file(trained / "tl-mtt" / "checkpoint.safetensors")
     actual = load_file(tmp_path / "tl-mtt" / "checkpoint.safetensors")
