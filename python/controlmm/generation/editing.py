@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -14,6 +15,11 @@ from torch import Tensor
 
 from controlmm.generation.objective import Objective
 from controlmm.generation.solvers.adamw import papers_optimizer
+from controlmm.generation.solvers.gradient import plain_gradient
+from controlmm.generation.token_mixture import token_mixture
+
+EditingOptimizer = Literal["adamw", "gradient"]
+_OPTIMIZERS = {"adamw": papers_optimizer, "gradient": plain_gradient}
 
 
 @dataclass(frozen=True)
@@ -21,15 +27,25 @@ class EditingBudget:
     """How many gradient steps editing may take."""
 
     logits_iterations: int = 0  # in each decoding step
+    logits_iterations_grow: bool = False  # step k takes k times as many: the published command's default, 35
+    logits_rate: float = 0.06  # of logits editing
     latent_iterations: int = 100  # after the last decoding step
     latent_rate: float = 0.05  # of latent editing, in standard deviations of the base codes
     decays_rate: bool = True  # cosine decay of the latents' rate to zero; the papers keep it constant
+    optimizer: EditingOptimizer = "adamw"  # published code; "gradient": plain steps, as the paper writes it
 
     def __post_init__(self) -> None:
         if self.logits_iterations < 0 or self.latent_iterations < 0:
             raise ValueError(f"Iterations must not be negative, got {self}.")
-        if not self.latent_rate > 0:
-            raise ValueError(f"`latent_rate` must be positive, got {self.latent_rate}.")
+        for name in ("logits_rate", "latent_rate"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"`{name}` must be positive, got {getattr(self, name)}.")
+        if self.optimizer not in _OPTIMIZERS:
+            raise ValueError(f"`optimizer` must be one of {tuple(_OPTIMIZERS)}, got {self.optimizer!r}.")
+
+    def logits_iterations_in(self, step: int) -> int:
+        """Gradient steps on the logits in decoding step ``step``, counted from 0."""
+        return self.logits_iterations * (step + 1 if self.logits_iterations_grow else 1)
 
 
 def edit_logits(
@@ -38,8 +54,11 @@ def edit_logits(
     codes: Float[Tensor, "K C"],
     *,
     iterations: int,
-    noise: Callable[[], Float[Tensor, "B L K"]],
+    noise: Callable[[], Float[Tensor, "B L K"] | None],
     keep: Float[Tensor, "B L 1"],
+    as_printed: bool = False,
+    rate: float = 0.06,
+    optimizer: EditingOptimizer = "adamw",
 ) -> Float[Tensor, "B L K"]:
     """Logits moved so that motions sampled from them meet the objective.
 
@@ -49,18 +68,21 @@ def edit_logits(
         logits: Base-layer logits.
         objective: What to minimise, on latents ``softmax(logits + noise) @ codes``.
         codes: Base codebook.
-        iterations: Gradient steps (AdamW).
-        noise: Draws fresh Gumbel noise for every step.
+        iterations: Gradient steps.
+        noise: Draws fresh Gumbel noise for every step; ``None`` means none.
         keep: 1 where a token belongs to a clip, 0 in padding.
+        as_printed: As in :func:`token_mixture`.
+        rate: Step length; 0.06 is the published one of AdamW.
+        optimizer: AdamW or plain gradient steps.
     """
     edited = logits.detach().clone().requires_grad_()
-    optimizer = papers_optimizer(edited)
+    stepper = _OPTIMIZERS[optimizer](edited, rate)
     for _ in range(iterations):
         with torch.enable_grad():
-            latents = (torch.softmax(edited + noise(), dim=-1) @ codes) * keep
+            latents = (token_mixture(edited, noise(), as_printed=as_printed) @ codes) * keep
         loss, gradient = objective.value_and_gradient(latents)
         if not loss.any():
             break
         (edited.grad,) = torch.autograd.grad(latents, edited, gradient)
-        optimizer.step()
+        stepper.step()
     return edited.detach()

@@ -4,24 +4,27 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from controlmm.generation.editing import edit_logits
+from controlmm.generation.decoding_rules import DecodingRules, likeliest_share
+from controlmm.generation.editing import EditingBudget, edit_logits
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.noise import ClipNoise
 from controlmm.generation.objective import ControlObjective
 from controlmm.generation.solvers import Progress
+from controlmm.generation.token_mixture import token_mixture
 from controlmm.models.control_branch import ControlBranch
 from controlmm.models.masked_transformer import MaskedTransformer
 from controlmm.models.residual_transformer import ResidualTransformer
+from controlmm.models.tokenizer import MotionTokenizer
 
 _DECIDED = 1e5  # confidence of tokens that are never masked again
-_TOP_SHARE = 0.1  # of the codes can be drawn in text-only decoding ("top-k 0.9")
+_RESIDUAL_TOP_SHARE = 0.1  # of the codes can be drawn in residual layers that are drawn
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,7 @@ class DecodingRequest:
     noise: ClipNoise
     steps: int = 10
     guidance_scale: float = 4.0
+    rules: DecodingRules = field(default_factory=DecodingRules)
     progress: Progress | None = None
 
     @property
@@ -60,8 +64,7 @@ def decode_from_text(base: MaskedTransformer, request: DecodingRequest) -> Int[T
         hidden = lowest(scores, masked_counts(request, step))
         ids = torch.where(hidden, base.mask_id, ids)
         logits = guided(partial(base, base.embed(ids), valid=valid), request)
-        kept = logits.topk(math.ceil(_TOP_SHARE * logits.shape[-1]), dim=-1).indices
-        allowed = torch.full_like(logits, -math.inf).scatter(-1, kept, logits.gather(-1, kept))
+        allowed = likeliest_share(logits, request.rules.text_top_share)
         drawn = (allowed + request.gumbel(logits.shape[-1])).argmax(-1)
         ids = torch.where(hidden, drawn, ids)
         confidence = logits.softmax(-1).gather(-1, drawn[..., None]).squeeze(-1)
@@ -77,14 +80,14 @@ def decode_with_control(
     objective: ControlObjective,
     request: DecodingRequest,
     *,
-    logits_iterations: int = 0,
+    budget: EditingBudget,
 ) -> Float[Tensor, "B L K"]:
     """Final base logits of motions that follow a text and spatial targets.
 
     Unlike without control, tokens stay soft: every step predicts all of them anew, and the motion comes from
     the last logits, not from the ids that were drawn on the way. Those only decide where MASK is put back.
     """
-    valid, codes = request.valid, decoder.tokenizer.base_codes
+    valid, codes, rules = request.valid, decoder.tokenizer.base_codes, request.rules
     keep = valid[..., None].float()
     frames = valid.repeat_interleave(decoder.downsample, dim=1)
     mask_embedding, mean_code = base.token_embedding.weight[base.mask_id], codes.mean(0)
@@ -98,18 +101,22 @@ def decode_with_control(
         signal = branch.signal(objective.targets, objective.mask, decoder(latents, frames))
         predict = partial(_controlled_logits, base, branch, embedded, signal, valid)
         logits = guided(predict, request)
-        if logits_iterations:
+        if budget.logits_iterations:
             logits = edit_logits(
                 logits,
                 objective,
                 codes,
-                iterations=logits_iterations,
-                noise=lambda: request.gumbel(len(codes)),
+                iterations=budget.logits_iterations_in(step),
+                noise=lambda: None if rules.editing_noise == "none" else request.gumbel(len(codes)),
                 keep=keep,
+                as_printed=rules.editing_noise == "as_printed",
+                rate=budget.logits_rate,
+                optimizer=budget.optimizer,
             )
-        probabilities = (logits + request.gumbel(len(codes))).softmax(-1)
-        embedded = base.embed_soft(probabilities)
-        drawn = (probabilities.log() + request.gumbel(len(codes))).argmax(-1)
+        weights = token_mixture(likeliest_share(logits, rules.top_share), request.gumbel(len(codes)))
+        embedded = base.embed_soft(weights)
+        second = request.gumbel(len(codes)) if rules.noise_twice else 0.0
+        drawn = (weights.log() + second).argmax(-1)
         confidence = logits.softmax(-1).gather(-1, drawn[..., None]).squeeze(-1)
         scores = torch.where(hidden[..., 0], confidence, _DECIDED)
         request.report(step + 1)
@@ -135,7 +142,10 @@ def fill_residual_layers(
     *,
     guidance_scale: float = 5.0,
 ) -> Int[Tensor, "B L Q"]:
-    """All layers of codes, the most likely one in each residual layer; -1 in padding."""
+    """All layers of codes, by default the most likely one in each residual layer.
+
+    -1 in padding, and where "no code" wins if the rules let it.
+    """
     layers = [base_ids]
     for layer in range(1, residual.config.num_quantizers):
         number = torch.full((len(base_ids),), layer)
@@ -144,9 +154,44 @@ def fill_residual_layers(
         history = residual.history(ids, number)
         predict = partial(residual, history, number, valid=request.valid)
         logits = guided(predict, request, scale=guidance_scale)
-        drawn = logits[..., : residual.pad_id].argmax(-1)  # a valid position always has a code
-        layers.append(torch.where(request.valid, drawn, -1))
+        if not request.rules.pad_class:
+            logits = logits[..., : residual.pad_id]  # a valid position always has a code
+        if request.rules.residual_tokens == "sampled":
+            logits = likeliest_share(logits, _RESIDUAL_TOP_SHARE) + request.gumbel(logits.shape[-1])
+        drawn = logits.argmax(-1)
+        layers.append(torch.where(request.valid & (drawn != residual.pad_id), drawn, -1))
     return torch.stack(layers, dim=-1)
+
+
+def final_base_ids(logits: Float[Tensor, "B L K"], request: DecodingRequest) -> Int[Tensor, "B L"]:
+    """Base codes that the last logits stand for; -1 in padding.
+
+    The likeliest ones, or drawn ones. Where "no code" is allowed it counts as one more code with logit 0, as
+    the published code has it.
+    """
+    if request.rules.final_tokens == "sampled":
+        logits = logits + request.gumbel(logits.shape[-1])
+    best, ids = logits.max(-1)
+    has_code = request.valid & ((best >= 0) | (not request.rules.pad_class))
+    return torch.where(has_code, ids, -1)
+
+
+def final_latents(
+    tokenizer: MotionTokenizer,
+    logits: Float[Tensor, "B L K"],
+    ids: Int[Tensor, "B L Q"],
+    request: DecodingRequest,
+) -> Float[Tensor, "B L C"]:
+    """Where latent editing starts: residual layers are hard, the base layer is a mean of codes.
+
+    Or hard, too, when the final tokens are drawn.
+    """
+    if request.rules.final_tokens == "sampled":
+        return tokenizer.quantizer.lookup(ids)
+    residuals = ids.clone()
+    residuals[..., 0] = -1
+    soft = token_mixture(logits) @ tokenizer.base_codes * request.valid[..., None]
+    return soft + tokenizer.quantizer.lookup(residuals)
 
 
 def guided(

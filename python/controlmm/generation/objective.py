@@ -10,6 +10,7 @@ from torch import Tensor
 
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.ops import frames_last, guidance_value_and_grad, masked_consistency_loss
+from controlmm.ops.consistency import Norm
 
 
 class Objective(Protocol):
@@ -33,13 +34,14 @@ class Measured(Protocol):
 
 
 class ControlObjective:
-    """Mean squared error of each clip's controlled coordinates in m^2 (MaskControl's inference loss).
+    """Error of each clip's controlled coordinates, by default their mean square in m^2 (MaskControl's loss).
 
     Args:
         decoder: Latents to joints.
         targets: (B, T, J, 3) metres.
         mask: (B, T, J, 3), the controlled coordinates.
         frames: (B, T), the frames of each clip.
+        norm: As in :func:`controlmm.ops.masked_consistency_loss`; the paper's words are "l2".
     """
 
     def __init__(
@@ -48,8 +50,10 @@ class ControlObjective:
         targets: Float[Tensor, "B T J 3"],
         mask: Bool[Tensor, "B T J 3"],
         frames: Bool[Tensor, "B T"],
+        *,
+        norm: Norm = "mse",
     ) -> None:
-        self.decoder = decoder
+        self.decoder, self.norm = decoder, norm
         self.targets, self.mask = frames_last(targets), frames_last(mask)
         self.frames = None if frames.all() else frames
         self._loss = torch.zeros(len(targets))
@@ -69,7 +73,7 @@ class ControlObjective:
             self.mask,
             mean=statistics.mean,
             std=statistics.std,
-            norm="mse",
+            norm=self.norm,
             out=self._gradient,
         )
         (gradient,) = torch.autograd.grad(decoded, latents, self._gradient)
@@ -79,15 +83,19 @@ class ControlObjective:
     def select(self, clips: Int[Tensor, "S"]) -> ControlObjective:
         """See :class:`Objective`."""
         frames = torch.ones(self.mask.shape[:2], dtype=torch.bool) if self.frames is None else self.frames
-        return ControlObjective(self.decoder, self.targets[clips], self.mask[clips], frames[clips])
+        return ControlObjective(
+            self.decoder, self.targets[clips], self.mask[clips], frames[clips], norm=self.norm
+        )
 
     def errors(self) -> Float[Tensor, "B"]:
-        """Root mean square distance of the controlled points in metres, at the latest evaluation.
+        """At least the mean distance of the controlled points in metres, at the latest evaluation.
 
-        It is never below their mean distance. Points with a free axis count as if their distance were larger
-        by at most the square root of 3.
+        By the mean square it is the root mean square distance; points with a free axis count as if their
+        distance were larger by at most the square root of 3.
         """
-        return (3 * self._loss).sqrt()
+        if self.norm == "l2":
+            return self._loss
+        return (3 * self._loss).sqrt() if self.norm == "mse" else 3 * self._loss
 
 
 def control_error(

@@ -17,11 +17,13 @@ from controlmm.generation.masked_decoding import (
     decode_from_text,
     decode_with_control,
     fill_residual_layers,
+    final_base_ids,
+    final_latents,
 )
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.noise import ClipNoise
 from controlmm.generation.objective import ControlObjective
-from controlmm.generation.solvers import Progress, Stopping, adamw
+from controlmm.generation.solvers import Progress, Stopping, adamw, gradient_descent
 from controlmm.models.control_branch import ControlBranch
 from controlmm.models.length_estimator import LengthEstimator
 from controlmm.models.masked_transformer import MaskedTransformer
@@ -153,6 +155,7 @@ class ControlMM(MotionPipeline):
                 ClipNoise([seeds[row] for row in rows.tolist()]),
                 steps=preset.steps,
                 guidance_scale=preset.guidance_scale,
+                rules=preset.rules,
                 progress=progress,
             )
 
@@ -176,30 +179,38 @@ class ControlMM(MotionPipeline):
     ) -> Tensor:
         frames = request.valid.repeat_interleave(self.decoder.downsample, dim=1)
         keep = request.valid[..., None].float()
-        objective = ControlObjective(self.decoder, targets, mask, frames)
+        objective = ControlObjective(self.decoder, targets, mask, frames, norm=preset.control_norm)
         logits = decode_with_control(
             self.transformer,
             self.control,
             self.decoder,
             objective,
             request,
-            logits_iterations=preset.budget.logits_iterations,
+            budget=preset.budget,
         )
-        base_ids = torch.where(request.valid, logits.argmax(-1), -1)
+        base_ids = final_base_ids(logits, request)
         ids = fill_residual_layers(
             self.residual, base_ids, request, guidance_scale=preset.residual_guidance_scale
         )
-        ids[..., 0] = -1  # the base layer stays a soft mixture, only the residual layers are hard
-        tokenizer = self.decoder.tokenizer
-        latents = logits.softmax(-1) @ tokenizer.base_codes * keep + tokenizer.quantizer.lookup(ids)
+        latents = final_latents(self.decoder.tokenizer, logits, ids, request)
+        return self._edit(latents, objective, keep, preset, request.progress)
+
+    def _edit(
+        self,
+        latents: Float[Tensor, "B L C"],
+        objective: ControlObjective,
+        keep: Float[Tensor, "B L 1"],
+        preset: Preset,
+        progress: Progress | None,
+    ) -> Float[Tensor, "B L C"]:
+        budget = preset.budget
+        stopping = Stopping(iterations=budget.latent_iterations)
+        rate = budget.latent_rate * self.decoder.tokenizer.base_codes.std().item()
+        if budget.optimizer == "gradient":
+            return gradient_descent(objective, latents, keep, stopping, rate=rate, progress=progress).latents
+        decays = budget.decays_rate
         return adamw(
-            objective,
-            latents,
-            keep,
-            Stopping(iterations=preset.budget.latent_iterations),
-            rate=preset.budget.latent_rate * tokenizer.base_codes.std().item(),
-            decays_rate=preset.budget.decays_rate,
-            progress=request.progress,
+            objective, latents, keep, stopping, rate=rate, decays_rate=decays, progress=progress
         ).latents
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+from controlmm.generation.decoding_rules import DecodingRules
 from controlmm.generation.editing import EditingBudget
+from controlmm.ops.consistency import NORM_CODES, Norm
 
 
 @dataclass(frozen=True)
@@ -16,10 +18,14 @@ class Preset:
     steps: int = 10  # of masked decoding
     guidance_scale: float = 4.0
     residual_guidance_scale: float = 5.0
+    control_norm: Norm = "mse"  # of the distance that editing minimises: published code; the paper: "l2"
+    rules: DecodingRules = field(default_factory=DecodingRules)
 
     def __post_init__(self) -> None:
         if isinstance(self.steps, bool) or not isinstance(self.steps, int) or self.steps < 1:
             raise ValueError(f"`steps` must be a whole number of at least 1, got {self.steps!r}.")
+        if self.control_norm not in NORM_CODES:
+            raise ValueError(f"`control_norm` must be one of {tuple(NORM_CODES)}, got {self.control_norm!r}.")
         for name in ("guidance_scale", "residual_guidance_scale"):
             value = getattr(self, name)
             if not isinstance(value, int | float) or not math.isfinite(value):

@@ -2,7 +2,17 @@
 
 from controlmm.generation.solvers.adamw import adamw
 from controlmm.generation.solvers.clip_search import Progress
+from controlmm.generation.solvers.gradient import gradient_descent
 from controlmm.generation.solvers.lbfgs import LbfgsTolerance, lbfgs
 from controlmm.generation.solvers.stopping import Reason, Solution, Stopping
 
-__all__ = ["LbfgsTolerance", "Progress", "Reason", "Solution", "Stopping", "adamw", "lbfgs"]
+__all__ = [
+    "LbfgsTolerance",
+    "Progress",
+    "Reason",
+    "Solution",
+    "Stopping",
+    "adamw",
+    "gradient_descent",
+    "lbfgs",
+]
