@@ -10,7 +10,22 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from controlmm.controls import JointControl, PathControl, PoseControl, load_controls, save_controls
+    from controlmm.controls import (
+        Avoid,
+        Box,
+        Capsule,
+        HalfSpace,
+        HeightField,
+        JointControl,
+        Objective,
+        PathControl,
+        Plane,
+        PoseControl,
+        Sphere,
+        TimelineEntry,
+        load_controls,
+        save_controls,
+    )
     from controlmm.motion.motion import Motion
     from controlmm.pipelines import ControlMM, GenerationResult
 
@@ -20,23 +35,41 @@ except PackageNotFoundError:  # used from a source tree without an installation
     __version__ = "0.0.0+source"
 
 _HOME_OF = {
+    "Avoid": "controlmm.controls",
+    "Box": "controlmm.controls",
+    "Capsule": "controlmm.controls",
     "ControlMM": "controlmm.pipelines",
     "GenerationResult": "controlmm.pipelines",
+    "HalfSpace": "controlmm.controls",
+    "HeightField": "controlmm.controls",
     "JointControl": "controlmm.controls",
     "Motion": "controlmm.motion.motion",
+    "Objective": "controlmm.controls",
     "PathControl": "controlmm.controls",
+    "Plane": "controlmm.controls",
     "PoseControl": "controlmm.controls",
+    "Sphere": "controlmm.controls",
+    "TimelineEntry": "controlmm.controls",
     "load_controls": "controlmm.controls",
     "save_controls": "controlmm.controls",
 }
 
 __all__ = [
+    "Avoid",
+    "Box",
+    "Capsule",
     "ControlMM",
     "GenerationResult",
+    "HalfSpace",
+    "HeightField",
     "JointControl",
     "Motion",
+    "Objective",
     "PathControl",
+    "Plane",
     "PoseControl",
+    "Sphere",
+    "TimelineEntry",
     "__version__",
     "load_controls",
     "save_controls",

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from controlmm.cli.generate import slug
-from controlmm.controls import ControlFile, PathControl, save_controls
+from controlmm.controls import Avoid, ControlFile, PathControl, Sphere, penetration, save_controls
 from controlmm.evaluation import foot_skating_ratio
 from controlmm.motion.motion import Motion
 
@@ -48,10 +48,37 @@ def test_writes_every_format_of_every_sample_and_prints_a_row_for_each(
         assert motion.num_frames == FRAMES
         distance = (motion.joints - motion.extra["targets"])[:, 0, [0, 2]].norm(dim=-1).mean().item()
         assert float(row[1]) == pytest.approx(distance / CENTIMETRE, abs=PRINTED)
-        assert row[2] == f"{foot_skating_ratio(motion.joints[None]).item():.3f}"
+        assert row[2] == "-"  # no obstacles
+        assert row[3] == f"{foot_skating_ratio(motion.joints[None]).item():.3f}"
         assert row[0] == str(index)
-        assert float(row[3]) > 0
         assert float(row[4]) > 0
+        assert float(row[5]) > 0
+
+
+def test_obstacles_of_the_control_file_and_of_their_own_file_count_together(
+    command: Command, tiny_pipeline_folder: Path, tmp_path: Path
+) -> None:
+    path = PathControl("pelvis", xz=[[0.0, 0.0], [0.0, 0.5]])
+    beside = Avoid(Sphere((0.5, 0.9, 0.2), 0.2), joints=["head"])
+    controls = ControlFile([path], seconds=SECONDS, text=PROMPT, obstacles=[beside])
+    inside = Avoid(Sphere((0.0, 0.9, 0.2), 2.0), margin=0.0)  # nobody gets out of it in so few steps
+    printed = command(
+        "generate", "--controls", save_controls(controls, tmp_path / "walk.json"),
+        "--obstacles", save_controls(ControlFile(obstacles=[inside]), tmp_path / "scene.json"),
+        "--preset", "fast", "--formats", "npz", "--out", tmp_path / "out", "--model", tiny_pipeline_folder,
+    )  # fmt: skip
+    motion = Motion.load(Path(printed.splitlines()[-1]))
+    assert [avoid.label for avoid in motion.extra["obstacles"]] == ["sphere", "sphere"]
+    depth = penetration(motion.joints[None], motion.extra["obstacles"], motion.skeleton).item()
+    assert depth > 0.1
+    assert float(printed.splitlines()[2].split()[2]) == pytest.approx(depth / CENTIMETRE, abs=PRINTED)
+
+
+def test_a_file_without_obstacles_is_refused_as_scene(
+    refused: Command, tiny_pipeline_folder: Path, walk_line: Path
+) -> None:
+    said = refused("generate", PROMPT, "--obstacles", walk_line, "--model", tiny_pipeline_folder)
+    assert 'line.json holds no obstacles. Give them as "obstacles": [...]' in said
 
 
 def test_prompt_and_length_come_from_the_control_file_when_not_given(

@@ -17,7 +17,10 @@ if TYPE_CHECKING:
     from controlmm.pipelines import GenerationResult
 
 _SLUG_LENGTH = 48
-_TITLES = ("sample", "control error (cm)", "foot skating ratio", "BVH fit error (mm)", "time (s)")
+_TITLES = (
+    "sample", "control error (cm)", "in obstacles (cm)", "foot skating ratio", "BVH fit error (mm)",
+    "time (s)",
+)  # fmt: skip
 _PER_METRE = {"m": 1.0, "mm": 1000.0}  # of a skeleton's unit
 
 
@@ -33,6 +36,10 @@ def generate(
         ),
     ] = None,
     controls: Annotated[Path | None, typer.Option(help="Control file: .json, .csv, .npy or .npz.")] = None,
+    obstacles: Annotated[
+        Path | None,
+        typer.Option(help="JSON file with obstacles to keep clear of, beside those in the control file."),
+    ] = None,
     preset: Annotated[str, typer.Option(help="fast, balanced or accurate.")] = "balanced",
     samples: Annotated[int, typer.Option(help="Number of motions.")] = 1,
     seed: Annotated[int, typer.Option(help="Same seed, same motions.")] = 0,
@@ -50,12 +57,14 @@ def generate(
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but the names of the files.")] = False,
 ) -> None:
     """Generate motions and print how well each of them meets its controls."""
+    from controlmm.cli.scene_options import all_obstacles
     from controlmm.controls import load_controls
 
     suffixes = _checked_formats(formats)
     document = load_controls(controls) if controls else None
     prompt = _chosen_prompt(prompt, document)
     seconds = _chosen_seconds(seconds, document, controls)
+    avoided = all_obstacles(document, obstacles)
 
     from controlmm.pipelines import ControlMM
 
@@ -65,6 +74,7 @@ def generate(
             prompt,
             seconds=seconds,
             controls=document.controls if document else (),
+            obstacles=avoided,
             samples=samples,
             preset=preset,
             guidance_scale=guidance,
@@ -139,8 +149,10 @@ def _report(result: GenerationResult, *, has_bvh: bool) -> str:
     skating = foot_skating_ratio(torch.stack([motion.joints for motion in result]), skeleton=skeleton)
     rows = []
     for index, motion in enumerate(result):
-        error = f"{100 * result.control_error[index].item() / unit:.2f}" if motion.extra else "-"
+        has_targets, has_obstacles = "targets" in motion.extra, "obstacles" in motion.extra
+        error = f"{100 * result.control_error[index].item() / unit:.2f}" if has_targets else "-"
+        depth = f"{100 * result.penetration[index].item():.2f}" if has_obstacles else "-"
         fit = f"{1000 * fit_rotations(motion.joints, skeleton).mean_error / unit:.1f}" if has_bvh else "-"
         share = result.seconds_taken / len(result)
-        rows.append((str(index), error, f"{skating[index].item():.3f}", fit, f"{share:.1f}"))
+        rows.append((str(index), error, depth, f"{skating[index].item():.3f}", fit, f"{share:.1f}"))
     return format_table(_TITLES, rows)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 from controlmm.controls.document import HEADER, ControlFile
 from controlmm.controls.joint import JointControl
+from controlmm.controls.json_obstacles import parse_obstacle
+from controlmm.controls.json_timeline import parse_entry
 from controlmm.controls.json_values import (
     PlacedError,
     check_constant,
@@ -23,6 +25,9 @@ from controlmm.controls.path import PathControl
 from controlmm.controls.pose import PoseControl
 from controlmm.controls.samples import Control
 
+_Item = TypeVar("_Item")
+_LISTS = ("controls", "obstacles", "timeline")
+
 
 def parse_json(content: bytes) -> ControlFile:
     """The controls in a JSON document.
@@ -32,16 +37,28 @@ def parse_json(content: bytes) -> ControlFile:
             ``controls[1].positions[3]``.
     """
     document = _decode(content)
-    check_keys(document, "", required=(*HEADER, "controls"), optional=("prompt", "seconds"))
+    check_type(document, "", dict, "an object")
+    needed = () if any(name in document for name in _LISTS[1:]) else ("controls",)
+    check_keys(document, "", required=(*HEADER, *needed), optional=("prompt", "seconds", *_LISTS))
     for key, expected in HEADER.items():
         check_constant(document[key], key, expected)
     if "prompt" in document:
         check_type(document["prompt"], "prompt", str, "a string")
     if "seconds" in document:
         check_number(document["seconds"], "seconds")
-    check_type(document["controls"], "controls", list, "a list")
-    controls = [_parse_control(item, f"controls[{index}]") for index, item in enumerate(document["controls"])]
-    return ControlFile(controls, seconds=document.get("seconds"), text=document.get("prompt"))
+    return ControlFile(
+        _parse_list(document, "controls", _parse_control),
+        seconds=document.get("seconds"),
+        text=document.get("prompt"),
+        obstacles=_parse_list(document, "obstacles", parse_obstacle),
+        timeline=_parse_list(document, "timeline", parse_entry),
+    )
+
+
+def _parse_list(document: dict[str, Any], name: str, parse: Callable[[Any, str], _Item]) -> list[_Item]:
+    items = document.get(name, [])
+    check_type(items, name, list, "a list")
+    return [parse(item, f"{name}[{index}]") for index, item in enumerate(items)]
 
 
 def _decode(content: bytes) -> Any:

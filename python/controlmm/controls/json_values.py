@@ -19,7 +19,7 @@ class PlacedError(ValueError):
 def check_keys(value: Any, where: str, *, required: Collection[str], optional: Collection[str]) -> None:
     """Refuse an object with unknown or missing keys (or something that is no object)."""
     check_type(value, where, dict, "an object")
-    known = sorted((*required, *optional))
+    known = sorted({*required, *optional})
     for key in value:
         if key not in known:
             near = difflib.get_close_matches(key, known, n=1)

@@ -8,8 +8,11 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from controlmm.controls.avoid import as_avoids
 from controlmm.controls.document import HEADER, ControlFile
 from controlmm.controls.joint import JointControl
+from controlmm.controls.json_obstacles import obstacle_as_dict
+from controlmm.controls.json_timeline import entry_as_dict
 from controlmm.controls.path import PathControl
 from controlmm.controls.pose import PoseControl
 from controlmm.controls.samples import Control
@@ -26,10 +29,20 @@ def format_json(file: ControlFile) -> str:
         head["prompt"] = file.text
     if file.seconds is not None:
         head["seconds"] = file.seconds
-    lines = [f'  "{key}": {json.dumps(value, ensure_ascii=False)},' for key, value in head.items()]
-    controls = ",\n".join(_format_control(_as_dict(control)) for control in file.controls)
-    body = f"[\n{controls}\n  ]" if controls else "[]"
-    return "\n".join(["{", *lines, f'  "controls": {body}', "}", ""])
+    entries = [f'  "{key}": {json.dumps(value, ensure_ascii=False)}' for key, value in head.items()]
+    lists = {
+        "controls": [_as_dict(control) for control in file.controls],
+        "obstacles": [obstacle_as_dict(obstacle) for obstacle in as_avoids(file.obstacles)],
+        "timeline": [entry_as_dict(entry) for entry in file.timeline],
+    }
+    entries += [
+        f'  "{name}": {_format_list(items)}' for name, items in lists.items() if items or name == "controls"
+    ]
+    return "\n".join(["{", ",\n".join(entries), "}", ""])
+
+
+def _format_list(items: list[dict[str, Any]]) -> str:
+    return "[\n" + ",\n".join(_format_item(item) for item in items) + "\n  ]" if items else "[]"
 
 
 def _as_dict(control: Control) -> dict[str, Any]:
@@ -57,13 +70,13 @@ def _numbers(points: Tensor, mask: Tensor | None = None) -> Any:
     return cells.tolist()
 
 
-def _format_control(values: dict[str, Any]) -> str:
+def _format_item(values: dict[str, Any]) -> str:
     entries = [f'      "{key}": {_format_value(value)}' for key, value in values.items()]
     return "\n".join(["    {", ",\n".join(entries), "    }"])
 
 
 def _format_value(value: Any) -> str:
     if not (isinstance(value, list) and value and isinstance(value[0], list)):
-        return json.dumps(value)
+        return json.dumps(value, ensure_ascii=False)
     rows = ",\n".join(f"        {json.dumps(row)}" for row in value)
     return f"[\n{rows}\n      ]"

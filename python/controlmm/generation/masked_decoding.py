@@ -75,7 +75,7 @@ def decode_from_text(base: MaskedTransformer, request: DecodingRequest) -> Int[T
 
 def decode_with_control(
     base: MaskedTransformer,
-    branch: ControlBranch,
+    branch: ControlBranch | None,
     decoder: MotionDecoder,
     objective: ControlObjective,
     request: DecodingRequest,
@@ -86,6 +86,7 @@ def decode_with_control(
 
     Unlike without control, tokens stay soft: every step predicts all of them anew, and the motion comes from
     the last logits, not from the ids that were drawn on the way. Those only decide where MASK is put back.
+    Without a ``branch`` only logits editing follows the objective, which then need not hold targets.
     """
     valid, codes, rules = request.valid, decoder.tokenizer.base_codes, request.rules
     keep = valid[..., None].float()
@@ -97,10 +98,12 @@ def decode_with_control(
     for step in range(request.steps):
         hidden = lowest(scores, masked_counts(request, step))[..., None]
         embedded = torch.where(hidden, mask_embedding, embedded)
-        latents = torch.where(hidden, mean_code, logits.softmax(-1) @ codes) * keep
-        signal = branch.signal(objective.targets, objective.mask, decoder(latents, frames))
-        predict = partial(_controlled_logits, base, branch, embedded, signal, valid)
-        logits = guided(predict, request)
+        if branch is None:
+            logits = guided(partial(base, embedded, valid=valid), request)
+        else:
+            latents = torch.where(hidden, mean_code, logits.softmax(-1) @ codes) * keep
+            signal = branch.signal(objective.targets, objective.mask, decoder(latents, frames))
+            logits = guided(partial(_controlled_logits, base, branch, embedded, signal, valid), request)
         if budget.logits_iterations:
             logits = edit_logits(
                 logits,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -9,7 +10,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from controlmm.generation.motion_decoder import MotionDecoder
-from controlmm.ops import frames_last, guidance_value_and_grad, masked_consistency_loss
+from controlmm.generation.terms import JointTerm
+from controlmm.ops import frames_last, guidance_value_and_grad, masked_consistency_loss, recover_joints
 from controlmm.ops.consistency import Norm
 
 
@@ -42,6 +44,7 @@ class ControlObjective:
         mask: (B, T, J, 3), the controlled coordinates.
         frames: (B, T), the frames of each clip.
         norm: As in :func:`controlmm.ops.masked_consistency_loss`; the paper's words are "l2".
+        terms: What is added to the error, such as obstacles.
     """
 
     def __init__(
@@ -52,10 +55,12 @@ class ControlObjective:
         frames: Bool[Tensor, "B T"],
         *,
         norm: Norm = "mse",
+        terms: Sequence[JointTerm] = (),
     ) -> None:
         self.decoder, self.norm = decoder, norm
         self.targets, self.mask = frames_last(targets), frames_last(mask)
         self.frames = None if frames.all() else frames
+        self.terms = tuple(terms)
         self._loss = torch.zeros(len(targets))
         self._gradient: Tensor | None = None  # of the decoder's output, written again at every evaluation
 
@@ -76,6 +81,10 @@ class ControlObjective:
             norm=self.norm,
             out=self._gradient,
         )
+        if self.terms:
+            values, slope = self._terms_and_gradient(decoded.detach())
+            loss = loss + values
+            self._gradient += slope
         (gradient,) = torch.autograd.grad(decoded, latents, self._gradient)
         self._loss = loss
         return loss, gradient
@@ -84,18 +93,36 @@ class ControlObjective:
         """See :class:`Objective`."""
         frames = torch.ones(self.mask.shape[:2], dtype=torch.bool) if self.frames is None else self.frames
         return ControlObjective(
-            self.decoder, self.targets[clips], self.mask[clips], frames[clips], norm=self.norm
+            self.decoder,
+            self.targets[clips],
+            self.mask[clips],
+            frames[clips],
+            norm=self.norm,
+            terms=[term.select(clips) for term in self.terms],
         )
 
     def errors(self) -> Float[Tensor, "B"]:
         """At least the mean distance of the controlled points in metres, at the latest evaluation.
 
         By the mean square it is the root mean square distance; points with a free axis count as if their
-        distance were larger by at most the square root of 3.
+        distance were larger by at most the square root of 3. Terms count as errors: a clip inside an obstacle
+        is not done.
         """
         if self.norm == "l2":
             return self._loss
         return (3 * self._loss).sqrt() if self.norm == "mse" else 3 * self._loss
+
+    @torch.enable_grad()
+    def _terms_and_gradient(
+        self, decoded: Float[Tensor, "B D T"]
+    ) -> tuple[Float[Tensor, "B"], Float[Tensor, "B D T"]]:
+        statistics = self.decoder.normalizer
+        decoded.requires_grad_()
+        features = statistics.denormalize(decoded.transpose(1, 2))
+        joints = recover_joints(features, joints=statistics.skeleton.num_joints)
+        values = torch.stack([term.values(joints) for term in self.terms]).sum(0)
+        (slope,) = torch.autograd.grad(values.sum(), decoded)
+        return values.detach(), slope
 
 
 def control_error(

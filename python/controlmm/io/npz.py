@@ -10,12 +10,16 @@ import numpy as np
 import torch
 from numpy import ndarray
 
+from controlmm.controls import ControlFile
+from controlmm.controls.json_reader import parse_json
+from controlmm.controls.json_writer import format_json
 from controlmm.io.atomic import replaced_on_success
 from controlmm.motion.motion import Motion
 from controlmm.motion.skeleton import SKELETONS, Skeleton
 
 _REQUIRED = ("joints", "skeleton", "fps")
 _CONTROLS = ("targets", "mask")
+_SCENE = ("obstacles", "timeline")
 _MAX_BYTES = 1 << 30  # a clip of 196 frames takes 0.3 MB; a gigabyte unpacked is an attack or a mistake
 
 
@@ -24,12 +28,13 @@ class NpzFormat:
 
     Arrays: ``joints`` (T, J, 3) float32 in the skeleton's unit, ``features`` (T, D) float32 if there are any,
     ``fps``, ``skeleton`` and ``text``; for a controlled motion ``targets`` (T, J, 3) float32 and ``mask``
-    (T, J, 3) bool, the coordinates that were asked for.
+    (T, J, 3) bool, the coordinates that were asked for; with obstacles or a timeline ``scene``, their JSON
+    document.
     """
 
     @staticmethod
     def save(motion: Motion, path: Path) -> None:
-        """Write the motion, and the targets and mask in ``motion.extra`` where there are any.
+        """Write the motion, and the targets, mask, obstacles and timeline in ``motion.extra``, if any.
 
         Raises:
             ValueError: If targets or mask do not have the shape of the joints.
@@ -43,6 +48,9 @@ class NpzFormat:
         if motion.features is not None:
             arrays["features"] = _float32(motion.features)
         arrays |= _controls_of(motion)
+        scene = {name: motion.extra[name] for name in _SCENE if motion.extra.get(name)}
+        if scene:
+            arrays["scene"] = np.str_(format_json(ControlFile(**scene)))
         with replaced_on_success(path) as partial:
             np.savez_compressed(partial, **arrays)
 
@@ -110,6 +118,9 @@ def _motion_of(arrays: dict[str, ndarray]) -> Motion:
             _check_shape(name, arrays[name], arrays["joints"].shape)
             dtype = torch.bool if name == "mask" else torch.float32
             extra[name] = _tensor(name, arrays[name]).to(dtype)
+    if "scene" in arrays:
+        document = parse_json(str(arrays["scene"]).encode())
+        extra |= {name: getattr(document, name) for name in _SCENE if getattr(document, name)}
     features = _tensor("features", arrays["features"]) if "features" in arrays else None
     if features is not None and not torch.isfinite(features).all():
         raise ValueError("`features` must be finite, the file holds NaN or infinity.")

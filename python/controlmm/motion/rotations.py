@@ -73,3 +73,10 @@ def rot6d_to_matrix(rot6d: Float[Tensor, "*B 6"]) -> Float[Tensor, "*B 3 3"]:
     x = torch.nn.functional.normalize(rot6d[..., :3], dim=-1)
     z = torch.nn.functional.normalize(torch.linalg.cross(x, rot6d[..., 3:], dim=-1), dim=-1)
     return torch.stack([x, torch.linalg.cross(z, x, dim=-1), z], dim=-1)
+
+
+def yaw_matrix(degrees: float) -> Float[Tensor, "3 3"]:
+    """Rotation about the vertical axis Y; positive turns to the left, from +Z towards +X."""
+    angle = torch.tensor(degrees, dtype=torch.float64).deg2rad()
+    sine, cosine = float(angle.sin()), float(angle.cos())
+    return torch.tensor([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])

@@ -25,6 +25,7 @@ from controlmm.ops.obstacles import (
     Sphere,
     pack_obstacles,
 )
+from controlmm.ops.signed_distance import signed_distances
 
 __all__ = [
     "Backend",
@@ -48,6 +49,7 @@ __all__ = [
     "obstacle_loss",
     "pack_obstacles",
     "recover_joints",
+    "signed_distances",
     "use_backend",
     "use_isa",
 ]

@@ -75,6 +75,19 @@ def _distance(points: _Points, obstacles: PackedObstacles, index: int) -> _Dista
     return _height_field(points, parameters, grid)
 
 
+def signed_distances(
+    joints: Float[Tensor, "B T J 3"], obstacles: PackedObstacles
+) -> Float[Tensor, "B T J O"]:
+    """Distance in metres of every joint to the surface of every obstacle, negative inside.
+
+    Args:
+        joints: Global joint positions in metres, Y up.
+        obstacles: The result of ``pack_obstacles``, of the dtype of ``joints``; still, or moving over T.
+    """
+    columns = [_distance(joints, obstacles, index) for index in range(len(obstacles))]
+    return torch.stack(columns, dim=-1) if columns else joints.new_zeros(*joints.shape[:3], 0)
+
+
 def obstacle_loss_reference(
     joints: Float[Tensor, "B T J 3"],
     obstacles: PackedObstacles,

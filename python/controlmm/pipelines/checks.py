@@ -6,9 +6,11 @@ import math
 from collections.abc import Sequence
 from numbers import Integral, Real
 
-from jaxtyping import Bool
+import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from controlmm.controls import Objective
 from controlmm.models.control_branch import ControlBranchConfig
 from controlmm.models.length_estimator import LengthEstimatorConfig
 from controlmm.models.masked_transformer import MaskedTransformerConfig
@@ -50,6 +52,37 @@ def check_sampling(*, samples: int, seed: int) -> None:
     for name, value, least in (("samples", samples, 1), ("seed", seed, 0)):
         if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
             raise ValueError(f"`{name}` must be a whole number of at least {least}, got {value!r}.")
+
+
+def check_objectives(
+    objectives: Sequence[Objective], frames: int, skeleton: Skeleton, origin: Float[Tensor, "3"]
+) -> tuple[tuple[Objective, bool], ...]:
+    """The objectives, each with whether it takes many clips at once; tried on two standing poses.
+
+    Raises:
+        TypeError: If an entry is no objective, or one returns no tensor.
+        ValueError: If an objective cannot be minimised, see :meth:`Objective.check`.
+    """
+    if not isinstance(objectives, Sequence):
+        raise TypeError(f"`objectives` must be a list of Objective, got {type(objectives).__name__}.")
+    for index, objective in enumerate(objectives):
+        if not isinstance(objective, Objective):
+            raise TypeError(
+                f"`objectives[{index}]` must be an Objective, got {type(objective).__name__}. "
+                "Wrap a function: Objective(fn)."
+            )
+    if not objectives:
+        return ()
+    trial = standing_poses(frames, skeleton) + origin
+    return tuple((objective, objective.check(trial)) for objective in objectives)
+
+
+def standing_poses(frames: int, skeleton: Skeleton) -> Float[Tensor, "2 T J 3"]:
+    """Two clips of a made-up body that shifts a little, no two joints or frames alike."""
+    generator = torch.Generator().manual_seed(0)
+    heights = torch.linspace(0.1, 1.6, skeleton.num_joints)[:, None] * torch.tensor([0.0, 1.0, 0.0])
+    sway = 0.1 * torch.rand(2, frames, skeleton.num_joints, 3, generator=generator)
+    return (heights + sway) * (1000.0 if skeleton.unit == "mm" else 1.0)
 
 
 def check_masks_end(mask: Bool[Tensor, "B T J 3"], lengths: Sequence[int]) -> None:

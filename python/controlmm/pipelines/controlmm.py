@@ -24,6 +24,7 @@ from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.noise import ClipNoise
 from controlmm.generation.objective import ControlObjective
 from controlmm.generation.solvers import Progress, Stopping, adamw, gradient_descent
+from controlmm.generation.terms import JointTerm
 from controlmm.models.control_branch import ControlBranch
 from controlmm.models.length_estimator import LengthEstimator
 from controlmm.models.masked_transformer import MaskedTransformer
@@ -131,11 +132,13 @@ class ControlMM(MotionPipeline):
         mask: Bool[Tensor, "B T J 3"],
         seeds: Sequence[int],
         preset: Preset,
+        terms: Sequence[JointTerm] = (),
         progress: Progress | None = None,
     ) -> Float[Tensor, "B L C"]:
         """Latents of a batch of clips of different texts, lengths and targets (canonical frame).
 
-        Clips without any target are decoded from text alone, the control branch off.
+        Clips without any target are decoded with the control branch off: from text alone, and then edited if
+        there are ``terms``.
 
         Raises:
             ValueError: If a target lies after the end of its clip.
@@ -160,11 +163,22 @@ class ControlMM(MotionPipeline):
             )
 
         free, controlled = (~is_controlled).nonzero()[:, 0], is_controlled.nonzero()[:, 0]
-        if len(free):
-            latents[free] = self._from_text(request_for(free), preset)
-        if len(controlled):
-            request = request_for(controlled)
-            latents[controlled] = self._from_control(request, targets[controlled], mask[controlled], preset)
+        for rows, branch in ((free, None), (controlled, self.control)):
+            if not len(rows):
+                continue
+            request = request_for(rows)
+            if branch is None and not terms:
+                latents[rows] = self._from_text(request, preset)
+                continue
+            objective = ControlObjective(
+                self.decoder,
+                targets[rows],
+                mask[rows],
+                valid[rows].repeat_interleave(step, dim=1),
+                norm=preset.control_norm,
+                terms=[term.select(rows) for term in terms],
+            )
+            latents[rows] = self._edited(request, objective, branch, preset)
         return latents
 
     def _from_text(self, request: DecodingRequest, preset: Preset) -> Tensor:
@@ -174,15 +188,30 @@ class ControlMM(MotionPipeline):
         )
         return self.decoder.tokenizer.quantizer.lookup(ids)
 
-    def _from_control(
-        self, request: DecodingRequest, targets: Tensor, mask: Tensor, preset: Preset
+    def _edited(
+        self,
+        request: DecodingRequest,
+        objective: ControlObjective,
+        branch: ControlBranch | None,
+        preset: Preset,
     ) -> Tensor:
-        frames = request.valid.repeat_interleave(self.decoder.downsample, dim=1)
         keep = request.valid[..., None].float()
-        objective = ControlObjective(self.decoder, targets, mask, frames, norm=preset.control_norm)
+        if branch is None and not preset.budget.logits_iterations:
+            latents = self._from_text(request, preset)
+        else:
+            latents = self._from_logits(request, objective, branch, preset)
+        return self._edit(latents, objective, keep, preset, request.progress)
+
+    def _from_logits(
+        self,
+        request: DecodingRequest,
+        objective: ControlObjective,
+        branch: ControlBranch | None,
+        preset: Preset,
+    ) -> Tensor:
         logits = decode_with_control(
             self.transformer,
-            self.control,
+            branch,
             self.decoder,
             objective,
             request,
@@ -192,8 +221,7 @@ class ControlMM(MotionPipeline):
         ids = fill_residual_layers(
             self.residual, base_ids, request, guidance_scale=preset.residual_guidance_scale
         )
-        latents = final_latents(self.decoder.tokenizer, logits, ids, request)
-        return self._edit(latents, objective, keep, preset, request.progress)
+        return final_latents(self.decoder.tokenizer, logits, ids, request)
 
     def _edit(
         self,

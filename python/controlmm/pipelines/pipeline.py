@@ -14,10 +14,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from controlmm.controls import Control
+from controlmm.controls import Avoid, Control, Objective, Obstacle
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.noise import clip_seeds
 from controlmm.generation.solvers import Progress
+from controlmm.generation.terms import JointTerm
 from controlmm.models.length_estimator import LengthEstimator
 from controlmm.motion.skeleton import Skeleton
 from controlmm.nn.checkpoint import PretrainedModel
@@ -50,9 +51,12 @@ class MotionPipeline(ABC):
         mask: Bool[Tensor, "B T J 3"],
         seeds: Sequence[int],
         preset: Preset,
+        terms: Sequence[JointTerm] = (),
         progress: Progress | None = None,
     ) -> Float[Tensor, "B L C"]:
         """Latents of a batch of clips of different texts, lengths and targets (the networks' frame).
+
+        ``terms`` are minimised beside the distance to the targets.
 
         Raises:
             ValueError: If a target lies after the end of its clip.
@@ -70,6 +74,8 @@ class MotionPipeline(ABC):
         seconds: float | None = None,
         frames: int | None = None,
         controls: Sequence[Control] = (),
+        obstacles: Sequence[Obstacle | Avoid] = (),
+        objectives: Sequence[Objective] = (),
         samples: int = 1,
         preset: str | Preset = "balanced",
         guidance_scale: float | None = None,
@@ -88,6 +94,9 @@ class MotionPipeline(ABC):
             controls: Targets in metres, Y up, ground at y = 0. The body starts facing +Z (its left is +X), at
                 x = z = 0 unless a control names the pelvis at frame 0. Contradicting or impossible frames are
                 refused.
+            obstacles: Shapes that joints keep out of, still or moving, in the world of the controls; wrap
+                one in :class:`Avoid` to choose joints and margin.
+            objectives: Differentiable functions of the joints to be made small.
             samples: How many motions; sample ``i`` is the same however many are asked for.
             preset: ``fast``, ``balanced``, ``accurate`` (the papers' iteration counts) or a :class:`Preset`.
             guidance_scale: How strongly the text counts; ``None`` takes the preset's.
@@ -95,19 +104,28 @@ class MotionPipeline(ABC):
             progress: Called as ``progress(phase, done, total)`` during long loops.
 
         Raises:
-            ValueError: If an argument is unusable; nothing has run then.
+            TypeError: If an argument has the wrong type; nothing has run then.
+            ValueError: If an argument is unusable, or a target lies inside an obstacle; nothing has run then.
         """
         started = time.perf_counter()
         check_sampling(samples=samples, seed=seed)
         plan = resolve_preset(preset)
         if guidance_scale is not None:
             plan = dataclasses.replace(plan, guidance_scale=guidance_scale)
-        arrange = partial(Scene.of_call, prompt, controls, skeleton=self.skeleton, max_frames=MAX_FRAMES)
+        arrange = partial(
+            Scene.of_call,
+            prompt,
+            controls,
+            obstacles=obstacles,
+            objectives=objectives,
+            skeleton=self.skeleton,
+            max_frames=MAX_FRAMES,
+        )
         if seconds is None and frames is None and self.length is not None:
             arrange(seconds=None, frames=MAX_FRAMES)  # an unusable call is refused before any network runs
             frames = self._drawn_frames(self.length, prompt, controls, seed)
         scene = arrange(seconds=seconds, frames=frames)
-        canonical = scene.canonical
+        canonical, step = scene.canonical, self.decoder.downsample
         latents = self.generate_latents(
             self.text_encoder.encode([scene.prompt]).pooled.expand(samples, -1),
             lengths=[scene.frames] * samples,
@@ -115,6 +133,7 @@ class MotionPipeline(ABC):
             mask=canonical.mask.expand(samples, -1, -1, -1),
             seeds=clip_seeds(seed, samples),
             preset=plan,
+            terms=scene.terms(samples, padded=-(-scene.frames // step) * step, skeleton=self.skeleton),
             progress=progress,
         )
         features = self.decoder.features(latents)[:, : scene.frames]

@@ -5,17 +5,29 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from controlmm.controls import Control, DenseControls, densify
+from controlmm.controls import (
+    Avoid,
+    Control,
+    DenseControls,
+    Objective,
+    Obstacle,
+    as_avoids,
+    check_targets_clear,
+    densify,
+    penetration,
+)
 from controlmm.generation.objective import control_error
+from controlmm.generation.terms import JointTerm, ObjectiveTerm, OnFloor, obstacle_terms
 from controlmm.motion.ground import grounded
 from controlmm.motion.motion import Motion
 from controlmm.motion.skeleton import Skeleton
-from controlmm.pipelines.checks import frame_count
+from controlmm.pipelines.checks import check_objectives, frame_count
 from controlmm.pipelines.output import GenerationResult
 from controlmm.pipelines.placement import moved, start_position
 from controlmm.text import check_prompt
@@ -23,19 +35,23 @@ from controlmm.text import check_prompt
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A checked call: prompt, length and targets.
+    """A checked call: prompt, length, targets, obstacles and objectives.
 
     Attributes:
         prompt: What the person does.
         frames: Length of the motion.
         controls: Targets as the caller gave them, metres, Y up.
         origin: Where the body starts on the ground; the networks' frame has it at x = z = 0.
+        obstacles: What joints keep out of, as the caller gave it.
+        objectives: Functions of the caller's, with whether each takes many clips at once.
     """
 
     prompt: str
     frames: int
     controls: DenseControls
     origin: Float[Tensor, "3"]
+    obstacles: tuple[Avoid, ...] = ()
+    objectives: tuple[tuple[Objective, bool], ...] = ()
 
     @classmethod
     def of_call(
@@ -43,6 +59,8 @@ class Scene:
         prompt: str,
         controls: Sequence[Control],
         *,
+        obstacles: Sequence[Obstacle | Avoid] = (),
+        objectives: Sequence[Objective] = (),
         seconds: float | None,
         frames: int | None,
         skeleton: Skeleton,
@@ -56,12 +74,45 @@ class Scene:
         prompt = check_prompt(prompt)
         count = frame_count(seconds=seconds, frames=frames, skeleton=skeleton, max_frames=max_frames)
         dense = densify(controls, count, skeleton)
-        return cls(prompt, count, dense, start_position(dense))
+        avoids = as_avoids(obstacles)
+        check_targets_clear(dense, avoids, skeleton)
+        origin = start_position(dense)
+        checked = check_objectives(objectives, count, skeleton, origin)
+        return cls(prompt, count, dense, origin, avoids, checked)
 
     @property
     def canonical(self) -> DenseControls:
         """The targets in the networks' frame."""
         return moved(self.controls, -self.origin)
+
+    @property
+    def stands_on_floor(self) -> bool:
+        """Whether the motions are moved onto the floor: they are without height targets."""
+        return not self.controls.mask[..., 1].any()
+
+    def terms(self, samples: int, *, padded: int, skeleton: Skeleton) -> tuple[JointTerm, ...]:
+        """What editing minimises beside the targets, for a batch of ``samples`` clips.
+
+        Args:
+            samples: Clips of the batch.
+            padded: Frames of the padded batch.
+            skeleton: Joints and unit.
+        """
+        lengths = torch.full((samples,), self.frames)
+        terms: list[JointTerm] = [
+            *obstacle_terms(
+                self.obstacles,
+                lengths=lengths.tolist(),
+                skeleton=skeleton,
+                origin=self.origin,
+                padded=padded,
+            ),
+            *(
+                ObjectiveTerm(objective, is_batched, lengths, self.origin)
+                for objective, is_batched in self.objectives
+            ),
+        ]
+        return tuple(OnFloor(term, lengths) if self.stands_on_floor else term for term in terms)
 
     def result(
         self, features: Float[Tensor, "S T D"], latents: Float[Tensor, "S L C"], *, seconds_taken: float
@@ -70,17 +121,22 @@ class Scene:
 
         Without height targets each motion is stood on the floor.
         """
-        if not self.controls.mask[..., 1].any():
+        if self.stands_on_floor:
             features = grounded(features)
         motions = tuple(self._motion(clip) for clip in features)
         joints = torch.stack([motion.joints for motion in motions])
         error = control_error(
             joints, self.controls.targets.expand_as(joints), self.controls.mask.expand_as(joints)
         )
-        return GenerationResult(motions, error, latents, seconds_taken)
+        depth = penetration(joints, self.obstacles, motions[0].skeleton)
+        return GenerationResult(motions, error, depth, latents, seconds_taken)
 
     def _motion(self, features: Float[Tensor, "T D"]) -> Motion:
         motion = Motion.from_features(features.contiguous(), text=self.prompt)
         controls = self.controls
-        extra = {} if controls.is_empty else {"targets": controls.targets, "mask": controls.mask}
+        extra: dict[str, Any] = {}
+        if not controls.is_empty:
+            extra |= {"targets": controls.targets, "mask": controls.mask}
+        if self.obstacles:
+            extra["obstacles"] = self.obstacles
         return dataclasses.replace(motion, joints=motion.joints + self.origin, extra=extra)

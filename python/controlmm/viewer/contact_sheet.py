@@ -15,7 +15,7 @@ from controlmm.viewer import palette
 from controlmm.viewer.pose_strip import draw_pose_strip
 from controlmm.viewer.scene import Scene, scene_of
 from controlmm.viewer.scene_panels import draw_overview, draw_top_view
-from controlmm.viewer.time_panels import draw_distances, draw_heights
+from controlmm.viewer.time_panels import draw_clearance, draw_distances, draw_heights
 
 _SIZE = (15.0, 9.2)  # inches
 _TITLE_CHARACTERS = 100
@@ -53,12 +53,14 @@ def contact_sheet(
     columns = rows[1].subgridspec(1, 3, width_ratios=[1.45, 1.0, 1.0], wspace=0.14)
     draw_overview(figure.add_subplot(columns[0]), scene)
     draw_top_view(figure.add_subplot(columns[1]), scene)
-    if scene.control_error() is None:
-        draw_heights(figure.add_subplot(columns[2]), scene, has_time_label=True)
-    else:
-        stacked = columns[2].subgridspec(2, 1, hspace=0.32)
-        draw_heights(figure.add_subplot(stacked[0]), scene, has_time_label=False)
-        draw_distances(figure.add_subplot(stacked[1]), scene)
+    curves = [draw_heights]
+    if scene.control_error() is not None:
+        curves.append(draw_distances)
+    if scene.obstacles:
+        curves.append(draw_clearance)
+    stacked = columns[2].subgridspec(len(curves), 1, hspace=0.32 if len(curves) < 3 else 0.5)
+    for row, draw in enumerate(curves):
+        draw(figure.add_subplot(stacked[row]), scene, has_time_label=row == len(curves) - 1)
     return figure
 
 

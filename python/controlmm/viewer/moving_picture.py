@@ -15,6 +15,7 @@ from numpy import ndarray
 from controlmm.viewer import palette
 from controlmm.viewer.camera import Camera
 from controlmm.viewer.ground import draw_grid, ground_box
+from controlmm.viewer.obstacles import draw_obstacles
 from controlmm.viewer.scene import Scene
 from controlmm.viewer.stick_figure import StickFigure
 from controlmm.viewer.target_style import target_color, target_marker, traced_joints
@@ -126,6 +127,7 @@ class MovingPicture:
 def _draw_still_life(axes: Axes, scene: Scene, camera: Camera) -> None:
     """The grid and all targets, pale: those of the moment are drawn over them."""
     draw_grid(axes, camera, ground_box(scene.joints, margin=0.4))
+    draw_obstacles(axes, scene, camera.project)
     for joint in scene.controlled_joints():
         asked = camera.project(scene.targets[scene.is_controlled[:, joint], joint])
         axes.plot(*asked.T, zorder=2, **(target_marker(scene, joint) | {"alpha": 0.3}))

@@ -11,6 +11,7 @@ INK = "#22262e"
 FAINT = "#8a93a3"
 GRID = "#dfe3ea"
 PATH = "#5b6577"
+OBSTACLE = "#7a6a4f"
 TARGET_EDGE = "#1b1b1b"
 # One for each controlled joint; with more joints than these (whole poses) targets take the limbs' colours.
 CONTROL = ("#c2185b", "#00897b", "#f2a900", "#6a3fb5", "#43a047", "#8d5b2b")

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
+from controlmm.controls import Avoid, TimelineEntry
 from controlmm.motion.motion import Motion
 from controlmm.motion.skeleton import Skeleton
 
@@ -25,6 +26,8 @@ class Scene:
         targets: (T, J, 3) metres; free coordinates take the joint's own, so a ground path is drawn at the
             height where the joint went.
         is_asked: (T, J, 3) coordinates that a control asked for.
+        obstacles: What joints kept out of, metres.
+        timeline: What each body part does when.
     """
 
     skeleton: Skeleton
@@ -33,6 +36,8 @@ class Scene:
     joints: Float[ndarray, "T J 3"]
     targets: Float[ndarray, "T J 3"]
     is_asked: Bool[ndarray, "T J 3"]
+    obstacles: tuple[Avoid, ...] = ()
+    timeline: tuple[TimelineEntry, ...] = ()
 
     @property
     def num_frames(self) -> int:
@@ -64,6 +69,8 @@ class Scene:
 def scene_of(motion: Motion, *, targets: Any = None, mask: Any = None) -> Scene:
     """Scene of a motion with the targets given, or else those in ``motion.extra``.
 
+    Obstacles and timeline are taken from ``motion.extra``.
+
     Args:
         motion: HumanML3D or KIT-ML motion.
         targets: (T, J, 3) in the skeleton's unit, tensor or array; where ``mask`` is false ignored.
@@ -86,6 +93,7 @@ def scene_of(motion: Motion, *, targets: Any = None, mask: Any = None) -> Scene:
     return Scene(
         skeleton=motion.skeleton, fps=motion.fps, text=motion.text, joints=joints,
         targets=wanted, is_asked=is_asked,
+        obstacles=tuple(motion.extra.get("obstacles", ())), timeline=tuple(motion.extra.get("timeline", ())),
     )  # fmt: skip
 
 

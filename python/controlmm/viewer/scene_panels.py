@@ -11,6 +11,7 @@ from numpy import ndarray
 from controlmm.viewer import palette
 from controlmm.viewer.camera import Camera
 from controlmm.viewer.ground import draw_grid, ground_box
+from controlmm.viewer.obstacles import draw_obstacles, obstacle_points
 from controlmm.viewer.scene import Scene
 from controlmm.viewer.stick_figure import StickFigure
 from controlmm.viewer.target_style import target_color, target_marker, traced_joints
@@ -18,6 +19,7 @@ from controlmm.viewer.target_style import target_color, target_marker, traced_jo
 _FIGURE_EVERY = 0.5  # metres that the joints move on average between two figures of the overview
 _FIGURES = (3, 9)  # fewest and most
 _FACING_EVERY = 0.4  # metres of way between two ticks that show the facing
+_OBSTACLE_REACH = 1.0  # metres around the way within which obstacles widen the picture
 _SMALLEST_MAP = 2.0  # metres across, so that standing still looks like it
 
 
@@ -27,6 +29,7 @@ def draw_overview(axes: Axes, scene: Scene) -> None:
     box = ground_box(scene.joints, margin=0.1)
     draw_grid(axes, camera, box)
     axes.plot(*camera.project(scene.joints[:, 0] * [1, 0, 1]).T, color=palette.FAINT, linewidth=1.4, zorder=1)
+    draw_obstacles(axes, scene, camera.project)
     frames = _frames_along(_mean_way(scene), every=_FIGURE_EVERY)
     nearness = camera.depth(scene.joints[frames, 0]).argsort().argsort()
     opacities = np.linspace(1.0, 0.22, len(frames))[::-1]
@@ -39,7 +42,7 @@ def draw_overview(axes: Axes, scene: Scene) -> None:
     corners = np.array([[x, 0.0, z] for x in box[:2] for z in box[2:]])
     _fit(
         axes,
-        camera.project(np.concatenate([scene.joints.reshape(-1, 3), _asked(scene), corners])),
+        camera.project(np.concatenate([scene.joints.reshape(-1, 3), _asked(scene), corners, _seen(scene)])),
         margin=0.12,
     )
     axes.axis("off")
@@ -49,13 +52,15 @@ def draw_overview(axes: Axes, scene: Scene) -> None:
 def draw_top_view(axes: Axes, scene: Scene) -> None:
     """Draw the ways from above: +Z, the first facing, is up, and so the figure's left (+X) is on the left."""
     root = scene.joints[:, 0][:, [0, 2]]
+    draw_obstacles(axes, scene, lambda points: points[..., [0, 2]])
     axes.plot(*root.T, color=palette.PATH, linewidth=2.2, zorder=2)
     _draw_facing(axes, scene)
     _draw_controls(axes, scene, scene.joints[..., [0, 2]], scene.targets[..., [0, 2]])
     axes.plot(*root[0], marker="o", markersize=9, color=palette.PAPER, markeredgecolor=palette.INK, zorder=11)
     axes.plot(*root[-1], marker="s", markersize=8, color=palette.INK, zorder=11)
     ways = scene.joints[:, [0, *traced_joints(scene)]].reshape(-1, 3)
-    _fit(axes, np.concatenate([ways, _asked(scene)])[:, [0, 2]], margin=0.3, smallest=_SMALLEST_MAP)
+    shown = np.concatenate([ways, _asked(scene), _seen(scene)])
+    _fit(axes, shown[:, [0, 2]], margin=0.3, smallest=_SMALLEST_MAP)
     axes.invert_xaxis()
     axes.grid(color=palette.GRID, linewidth=0.8)
     axes.set_axisbelow(True)
@@ -110,6 +115,14 @@ def _frames_along(way: Float[ndarray, "T"], *, every: float) -> list[int]:
     frames = np.searchsorted(way, np.linspace(0, way[-1], count), side="left")
     frames[-1] = len(way) - 1
     return [int(frame) for frame in np.unique(frames)]
+
+
+def _seen(scene: Scene) -> Float[ndarray, "N 3"]:
+    """Points of obstacles near the way; of large and far ones only what is near is shown."""
+    points, ways = obstacle_points(scene), scene.joints.reshape(-1, 3)
+    low, high = ways.min(0) - _OBSTACLE_REACH, ways.max(0) + _OBSTACLE_REACH
+    near: ndarray = points[((points >= low) & (points <= high)).all(1)]
+    return near
 
 
 def _asked(scene: Scene) -> Float[ndarray, "N 3"]:

@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from controlmm.viewer import palette
+from controlmm.viewer.obstacles import clearance_over_time
 from controlmm.viewer.scene import Scene
 from controlmm.viewer.target_style import is_dense, target_color, target_marker, traced_joints
 
@@ -31,7 +32,7 @@ def draw_heights(axes: Axes, scene: Scene, *, has_time_label: bool) -> None:
     _finish(axes, scene, title="height (m)", has_time_label=has_time_label)
 
 
-def draw_distances(axes: Axes, scene: Scene) -> None:
+def draw_distances(axes: Axes, scene: Scene, *, has_time_label: bool) -> None:
     """Draw the distances to the targets in cm: each controlled joint's, or mean and largest of a pose."""
     seconds = np.arange(scene.num_frames) / scene.fps
     distances = np.where(scene.is_controlled, 100 * scene.distances, np.nan)
@@ -48,7 +49,19 @@ def draw_distances(axes: Axes, scene: Scene) -> None:
         )
         axes.plot(seconds[asked], np.nanmean(distances[asked], axis=1), "D", color=palette.INK, label="mean")
     axes.set_ylim(0, max(1e-3, 1.08 * float(np.nanmax(distances))))
-    _finish(axes, scene, title="distance to target (cm)", has_time_label=True)
+    _finish(axes, scene, title="distance to target (cm)", has_time_label=has_time_label)
+
+
+def draw_clearance(axes: Axes, scene: Scene, *, has_time_label: bool) -> None:
+    """Draw the room in cm between the obstacles and the nearest joint that avoids them; below 0: inside."""
+    room = clearance_over_time(scene)
+    if room is None:
+        return
+    seconds = np.arange(scene.num_frames) / scene.fps
+    axes.plot(seconds, 100 * room, color=palette.OBSTACLE, linewidth=1.6, label="nearest point")
+    axes.axhline(0.0, color=palette.RIGHT, linewidth=1.0, linestyle="--")
+    axes.set_ylim(min(-5.0, 100 * float(room.min()) - 2), max(20.0, 100 * float(np.minimum(room, 0.6).max())))
+    _finish(axes, scene, title="room to obstacles (cm)", has_time_label=has_time_label)
 
 
 def _label(scene: Scene, joint: int) -> str:
