@@ -271,4 +271,4 @@ def test_checkpoints_of_the_published_size_become_the_paper_configurations(share
     assert pipeline.decoder.tokenizer.config == RvqVaeConfig.paper()
     assert pipeline.transformer.config == MaskedTransformerConfig.paper()
     assert pipeline.residual.config == ResidualTransformerConfig.paper()
-    assert pipeline.control.config == ControlBranchConfig.paper()
+    assert pipeline.control.config == ControlBranchConfig.published()

@@ -25,12 +25,31 @@ NETWORKS = [
 
 @pytest.mark.parametrize(
     ("network", "config", "millions"),
-    [(*pair, size) for pair, size in zip(NETWORKS, (19.44, 12.05, 13.36, 21.42), strict=True)],
+    [
+        (RvqVae, RvqVaeConfig.paper(), 19.44),
+        (MaskedTransformer, MaskedTransformerConfig.paper(), 12.05),
+        (ResidualTransformer, ResidualTransformerConfig.paper(), 13.36),
+        (ControlBranch, ControlBranchConfig.published(), 21.42),
+        (ControlBranch, replace(ControlBranchConfig.published(), joints=(0,)), 21.37),
+    ],
 )
 def test_paper_configurations_have_the_published_sizes(network, config, millions):
     with torch.device("meta"):
-        count = sum(parameter.numel() for parameter in network(config.paper()).parameters())
+        count = sum(parameter.numel() for parameter in network(config).parameters())
     assert round(count / 1e6, 2) == millions
+
+
+@pytest.mark.parametrize("size", ["tiny", "small", "paper"])
+def test_branches_trained_here_are_told_which_targets_exist(size):
+    """A target of zero must not look like none; only the published layout cannot tell them apart."""
+    told, published = getattr(ControlBranchConfig, size)(), ControlBranchConfig.published()
+    for config, differs in ((told, True), (published, False)):
+        branch = ControlBranch(replace(config, encoder_width=8, layers=1))
+        zero, none = torch.zeros(1, 4, 22, 3), torch.zeros(1, 4, 22, 3, dtype=torch.bool)
+        at_origin = none.clone()
+        at_origin[:, 2, 0] = True
+        signals = [branch.signal(zero, mask, zero) for mask in (at_origin, none)]
+        assert torch.equal(*signals) != differs
 
 
 @pytest.mark.parametrize("size", ["tiny", "small", "paper"])

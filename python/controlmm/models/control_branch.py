@@ -52,7 +52,12 @@ class ControlBranchConfig:
 
     @classmethod
     def paper(cls) -> ControlBranchConfig:
-        """The published size: 21.4 M parameters, six joints."""
+        """The published size, 21.4 M parameters, for six joints, with the mask in the signal."""
+        return cls()
+
+    @classmethod
+    def published(cls) -> ControlBranchConfig:
+        """The layout of the published weights: their signal does not say which targets exist."""
         return cls(has_observation_mask=False)
 
     @classmethod
