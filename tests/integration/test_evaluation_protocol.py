@@ -155,7 +155,7 @@ def test_results_are_written_for_people_and_programs(
     text = (tmp_path / "results.md").read_text()
     assert text.startswith("# A title\n\n- seed: 0\n")
     assert text.endswith("never with published ones.\n")
-    assert "| real motion | – | – | – | " in text  # noqa: RUF001
+    assert "| real motion | - | - | - | " in text
     content = json.loads((tmp_path / "results.json").read_text())
     assert [row["label"] for row in content["rows"]] == ["real motion", "reconstruction", "quick"]
     assert content["rows"][0]["metrics"]["r1"]["mean"] is None

@@ -60,12 +60,12 @@ def evaluate(
     protocol = Protocol(repeats, limit, seed, mask_padding)
     judge = load_evaluator(evaluator)
     test_set = read_test_set(
-        data, split=split, kinds=_listed(captions), sources=_listed(sources) if sources else None
+        data, split=split, kinds=listed(captions), sources=listed(sources) if sources else None
     )
     setting.check(test_set.skeleton)
     rows = _rows([Path(m) for m in model] if model else [None], preset or ["balanced"], setting)
     scores = evaluate_rows(rows, test_set, judge, protocol, out, progress=not quiet)
-    facts = _facts(test_set, protocol, seconds=time.perf_counter() - started)
+    facts = facts_of(test_set, protocol, seconds=time.perf_counter() - started)
     page = ResultPage(f"Control of {control}, density {density}", facts, scores, judge.caution)
     page.write(out)
     typer.echo(page.markdown())
@@ -100,7 +100,8 @@ def load_pipeline(path: Path | None) -> MotionPipeline:
     return ControlMM.from_pretrained(path)
 
 
-def _facts(test_set: TestSet, protocol: Protocol, *, seconds: float) -> dict[str, object]:
+def facts_of(test_set: TestSet, protocol: Protocol, *, seconds: float) -> dict[str, object]:
+    """What must be said beside numbers: command, revision, machine, seconds, data, captions, seed."""
     from controlmm.evaluation.machine import machine, revision
 
     sources = ", ".join(f"{name} {count}" for name, count in sorted(test_set.sources.items()))
@@ -117,5 +118,6 @@ def _facts(test_set: TestSet, protocol: Protocol, *, seconds: float) -> dict[str
     }
 
 
-def _listed(text: str) -> list[str]:
+def listed(text: str) -> list[str]:
+    """The parts of an option that holds several, comma-separated."""
     return [name.strip() for name in text.split(",") if name.strip()]

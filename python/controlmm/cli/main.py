@@ -20,6 +20,7 @@ from controlmm.cli.generate import generate
 from controlmm.cli.info import info
 from controlmm.cli.plot import plot
 from controlmm.cli.prepare import prepare
+from controlmm.cli.reproduce import reproduce
 from controlmm.cli.train import train
 
 USER_ERROR = 2  # exit code
@@ -49,7 +50,18 @@ def _options(
     """Text plus 3D control in, human motion out."""
 
 
-for _command in (generate, info, prepare, train, plot, assemble, convert, convert_evaluator, evaluate):
+for _command in (
+    generate,
+    info,
+    prepare,
+    train,
+    plot,
+    assemble,
+    convert,
+    convert_evaluator,
+    evaluate,
+    reproduce,
+):
     app.command()(_command)
 app.add_typer(controls_app, name="controls")
 

@@ -29,11 +29,12 @@ class ControlSetting:
     Attributes:
         control: A joint's name; ``random`` (one of the six for each sample), ``cross`` (one of their 63
             combinations for each sample), ``lower`` (pelvis and feet), ``all`` (all six), ``none``.
-        density: 1, 2, 5, 49 or 196 keyframes; ``"all"`` draws one of these for each sample.
+        density: 1, 2, 5, 49 or 196 keyframes; ``"all"`` draws one of these for each sample; a fraction such
+            as 0.25 takes that share of the frames (TLControl, Figure 7).
     """
 
     control: str
-    density: int | str = EVERY_DENSITY
+    density: int | float | str = EVERY_DENSITY
 
     def check(self, skeleton: Skeleton) -> None:
         """Raise ``ValueError`` if there is no such joint, group or density."""
@@ -43,7 +44,8 @@ class ControlSetting:
                 f"`control` must be a joint ({', '.join(skeleton.joint_names)}) or one of "
                 f"{', '.join(GROUPS)}, got {self.control!r}."
             )
-        if self.density not in (*DENSITIES, EVERY_DENSITY):
+        is_share = isinstance(self.density, float) and 0 < self.density <= 1
+        if self.density not in (*DENSITIES, EVERY_DENSITY) and not is_share:
             raise ValueError(
                 f"`density` must be one of {', '.join(map(str, DENSITIES))} or {EVERY_DENSITY}, "
                 f"got {self.density!r}."
@@ -72,10 +74,12 @@ def draw_joints(control: str, skeleton: Skeleton, generator: torch.Generator) ->
     return (0,) if control == _PELVIS else (skeleton.joint_index(control),)
 
 
-def draw_frames(density: int | str, length: int, generator: torch.Generator) -> Int[Tensor, "K"]:
-    """Distinct frames of ``[0, length)``, uniform: 1, 2 or 5 of them; 49: a quarter; 196: all."""
+def draw_frames(density: int | float | str, length: int, generator: torch.Generator) -> Int[Tensor, "K"]:
+    """Distinct frames of ``[0, length)``, uniform: 1, 2 or 5 of them; 49: a quarter; 196: all; or a share."""
     if density == EVERY_DENSITY:
         density = DENSITIES[draw(len(DENSITIES), generator)]
+    if isinstance(density, float):
+        return torch.randperm(length, generator=generator)[: max(1, round(density * length))]
     count = {_QUARTER: length // 4, _WHOLE: length}.get(int(density), int(density))
     return torch.randperm(length, generator=generator)[: min(count, length)]
 

@@ -25,10 +25,10 @@ class Column:
     factor: float = 1.0
 
     def cell(self, row: RowScores) -> str:
-        """The metric of a row, or ``–`` where it does not apply."""
+        """The metric of a row, or ``-`` where it does not apply."""
         found = row[self.metric] if self.metric in row.repeats else Interval(math.nan, 0.0)
         if math.isnan(found.mean):
-            return "–"  # noqa: RUF001 (the papers' tables have it)
+            return "-"
         return Interval(self.factor * found.mean, self.factor * found.half_width).shown(self.digits)
 
 
@@ -89,7 +89,7 @@ class ResultPage:
         (out / RESULTS_MARKDOWN).write_text(self.markdown(), encoding="utf-8")
         content = {"title": self.title, **self.facts, "caution": self.caution}
         content["rows"] = [row.as_json() for row in self.rows]
-        (out / RESULTS_JSON).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        write_json(out / RESULTS_JSON, content)
 
     def markdown(self) -> str:
         """The page with all tables."""
@@ -102,6 +102,11 @@ class ResultPage:
             )
         ]  # fmt: skip
         return "\n\n".join([f"# {self.title}", facts, *tables, self.caution]) + "\n"
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write ``content``, indented."""
+    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
 def markdown_table(rows: Sequence[RowScores], columns: Sequence[Column]) -> str:

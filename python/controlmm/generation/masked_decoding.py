@@ -38,6 +38,7 @@ class DecodingRequest:
     guidance_scale: float = 4.0
     rules: DecodingRules = field(default_factory=DecodingRules)
     progress: Progress | None = None
+    watch: Callable[[int, Float[Tensor, "B L"]], None] | None = None  # (step, confidence of every token)
 
     @property
     def lengths(self) -> list[int]:
@@ -49,10 +50,12 @@ class DecodingRequest:
         """Fresh noise for every token of every clip."""
         return self.noise.gumbel(self.lengths, padded=self.valid.shape[1], width=width)
 
-    def report(self, step: int) -> None:
-        """Tell the caller that ``step`` steps are done."""
+    def report(self, step: int, confidence: Float[Tensor, "B L"]) -> None:
+        """Tell the caller that ``step`` steps are done, and how sure the model was of what it drew."""
         if self.progress is not None:
             self.progress("masked decoding", step, self.steps)
+        if self.watch is not None:
+            self.watch(step, confidence)
 
 
 def decode_from_text(base: MaskedTransformer, request: DecodingRequest) -> Int[Tensor, "B L"]:
@@ -69,7 +72,7 @@ def decode_from_text(base: MaskedTransformer, request: DecodingRequest) -> Int[T
         ids = torch.where(hidden, drawn, ids)
         confidence = logits.softmax(-1).gather(-1, drawn[..., None]).squeeze(-1)
         scores = torch.where(hidden, confidence, _DECIDED)
-        request.report(step + 1)
+        request.report(step + 1, confidence)
     return torch.where(valid, ids, -1)
 
 
@@ -122,7 +125,7 @@ def decode_with_control(
         drawn = (weights.log() + second).argmax(-1)
         confidence = logits.softmax(-1).gather(-1, drawn[..., None]).squeeze(-1)
         scores = torch.where(hidden[..., 0], confidence, _DECIDED)
-        request.report(step + 1)
+        request.report(step + 1, confidence)
     return logits
 
 

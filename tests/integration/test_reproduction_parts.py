@@ -1,0 +1,81 @@
+"""Parts of the reproduced tables: the ablated control model, averages, confidence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from controlmm.evaluation.confidence import confidence_records
+from controlmm.evaluation.control_draws import ControlSetting, draw_mask
+from controlmm.evaluation.controlmm_tables import TABLES, Study, without_control_model
+from controlmm.evaluation.motion_sources import Batch, Generated
+from controlmm.evaluation.random_streams import stream
+from controlmm.evaluation.reproduction import mean_of
+from controlmm.evaluation.scores import RowScores
+from controlmm.evaluation.test_set import TestSet, read_test_set
+from controlmm.generation.editing import EditingBudget
+from controlmm.motion.skeleton import HUMANML3D
+from controlmm.pipelines import ControlMM, Preset
+
+PLAIN = Preset(EditingBudget(latent_iterations=0), steps=2)
+ROUNDING = 1e-4  # of joints in metres, float32
+
+
+@pytest.fixture(scope="module")
+def test_set(tiny_data_folder: Path) -> TestSet:
+    return read_test_set(tiny_data_folder, split="train")
+
+
+def _batch(test_set: TestSet, seed: int = 0) -> Batch:
+    samples = test_set.samples(seed=seed, repeat=0)[:3]
+    setting = ControlSetting("pelvis", 5)
+    masks = [
+        draw_mask(setting, s.length, HUMANML3D, frames=196, generator=stream(seed, s.id)) for s in samples
+    ]
+    return Batch.of(samples, masks, seed=seed, repeat=0)
+
+
+def test_without_the_control_model_targets_change_nothing_that_editing_does_not(
+    tiny_pipeline: ControlMM, test_set: TestSet
+) -> None:
+    batch = _batch(test_set)
+    moved = Batch(batch.samples, batch.real, batch.joints + 0.5, batch.mask, batch.noise_seeds)
+    for pipeline, depends in ((without_control_model(tiny_pipeline), False), (tiny_pipeline, True)):
+        source = Generated(pipeline, PLAIN)
+        first, second = source.motions(batch).features, source.motions(moved).features
+        assert torch.allclose(first, second, atol=ROUNDING) is not depends
+
+
+def test_the_ablated_model_is_the_same_in_every_run(tiny_pipeline: ControlMM) -> None:
+    first, second = (Generated(without_control_model(tiny_pipeline), PLAIN).describe() for _ in range(2))
+    assert first == second
+    assert first != Generated(tiny_pipeline, PLAIN).describe()
+
+
+def test_effort_scales_the_papers_iterations(tiny_pipeline: ControlMM) -> None:
+    full, tenth = Study(tiny_pipeline).accurate.budget, Study(tiny_pipeline, effort=0.1).accurate.budget
+    assert (full.logits_iterations, full.latent_iterations) == (100, 600)
+    assert (tenth.logits_iterations, tenth.latent_iterations) == (10, 60)
+
+
+def test_the_ablation_has_the_papers_eight_cases(tiny_pipeline: ControlMM) -> None:
+    table = TABLES["table3"](Study(tiny_pipeline))
+    assert [line.keys for line in table.lines] == [row[:4] for row in table.published.rows]
+
+
+def test_an_average_is_taken_repeat_by_repeat() -> None:
+    rows = [RowScores(name, {"fid": values}, 32, {}) for name, values in (("a", [1, 3]), ("b", [2, 6]))]
+    assert mean_of(rows).repeats == {"fid": [1.5, 4.5]}
+
+
+def test_confidence_is_of_valid_tokens_only(tiny_pipeline: ControlMM, test_set: TestSet) -> None:
+    batch = _batch(test_set)
+    for record in confidence_records(tiny_pipeline, batch, steps=3, iterations=1):
+        tokens = batch.lengths // 4
+        assert record.steps.shape == (3, 3, int(tokens.max()))
+        for clip, count in enumerate(tokens.tolist()):
+            assert record.steps[:, clip, :count].isfinite().all()
+            assert record.steps[:, clip, count:].isnan().all()
+        assert record.mean.shape == (3,)
