@@ -11,6 +11,7 @@ from torch import Tensor
 
 from controlmm.evaluation.controlmm_tables import without_control_model
 from controlmm.evaluation.motion_sources import Batch
+from controlmm.generation.editing import EditingBudget
 from controlmm.generation.masked_decoding import DecodingRequest, decode_from_text, decode_with_control
 from controlmm.generation.noise import ClipNoise
 from controlmm.generation.objective import ControlObjective
@@ -93,7 +94,7 @@ def _watched(
         pipeline.decoder,
         objective,
         request,
-        logits_iterations=iterations,
+        budget=EditingBudget(logits_iterations=iterations),
     )
     return torch.stack(seen)
 

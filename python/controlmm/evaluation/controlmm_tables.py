@@ -48,7 +48,9 @@ class Study:
 
     def paper_preset(self, *, logits: int, codebook: int, steps: int = 10) -> Preset:
         """The paper's editing with these iteration counts, times ``effort``."""
-        budget = EditingBudget(round(self.effort * logits), round(self.effort * codebook))
+        budget = EditingBudget(
+            logits_iterations=round(self.effort * logits), latent_iterations=round(self.effort * codebook)
+        )
         return Preset(budget, steps=steps)
 
     @property
