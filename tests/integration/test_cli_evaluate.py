@@ -29,6 +29,7 @@ def test_it_prints_and_writes_tables_with_real_motion_first(
     assert any(line.startswith("| pipeline, fast |") for line in lines)
     assert "- captions: annotator, written, kinematic" in printed
     assert "- clips: 2 a repeat of 2 in the split test (synthetic 2)" in printed
+    assert "| pipeline, perplexity of 32 |" in printed
     rows = json.loads((tmp_path / "out" / "results.json").read_text())["rows"]
     assert rows[2]["metrics"]["keys"]["mean"] >= 5
 
@@ -40,6 +41,13 @@ def test_the_same_command_computes_nothing_again(
     files = {file: file.stat().st_mtime_ns for file in (tmp_path / "out").rglob("*.safetensors")}
     command(*arguments, "--preset", "fast")
     assert {file: file.stat().st_mtime_ns for file in (tmp_path / "out").rglob("*.safetensors")} == files
+
+
+def test_two_models_need_two_names(
+    refused: Callable[..., str], arguments: list[object], tiny_pipeline_folder: Path
+) -> None:
+    message = refused(*arguments, "--model", tiny_pipeline_folder)
+    assert "Model folders must have different names, got pipeline, pipeline" in message
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,9 @@ from controlmm.evaluation import (
     published_skating_ratio,
     root_aligned_error,
 )
+from controlmm.evaluation.reconstruction import code_statistics
 from controlmm.motion.features import joints_to_features
+from controlmm.pipelines import ControlMM
 
 ROUNDING = 1e-5  # of float32 sums over a clip
 PAD = 30
@@ -108,3 +110,14 @@ def test_lengths_are_checked() -> None:
         floor_penetration(torch.zeros(1, 4, 22, 3), lengths=torch.tensor([5]))
     with pytest.raises(ValueError, match=r"`joints` must be \(B, T, J, 3\)"):
         mean_jerk(torch.zeros(4, 22, 3))
+
+
+def test_codes_of_all_clips_are_counted_together(
+    tiny_pipeline: ControlMM, walking_joints: torch.Tensor
+) -> None:
+    clip = joints_to_features(walking_joints).float()
+    once, twice = (code_statistics(tiny_pipeline.decoder, [clip] * times) for times in (1, 2))
+    assert torch.equal(once.perplexity, twice.perplexity)
+    assert once.perplexity.shape == once.usage.shape == (3,)
+    assert (once.perplexity >= 1).all()
+    assert (once.perplexity <= 32 * once.usage + ROUNDING).all()  # at most the number of codes in use

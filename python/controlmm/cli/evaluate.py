@@ -5,12 +5,14 @@ from __future__ import annotations
 import shlex
 import sys
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 if TYPE_CHECKING:
+    from controlmm.evaluation.control_draws import ControlSetting
     from controlmm.evaluation.protocol import Protocol, Row
     from controlmm.evaluation.test_set import TestSet
     from controlmm.pipelines.pipeline import MotionPipeline
@@ -52,6 +54,7 @@ def evaluate(
     from controlmm.evaluation.control_draws import ControlSetting
     from controlmm.evaluation.evaluators import load_evaluator
     from controlmm.evaluation.protocol import Protocol, evaluate_rows
+    from controlmm.evaluation.reconstruction import code_statistics
     from controlmm.evaluation.report import ResultPage
     from controlmm.evaluation.test_set import read_test_set
 
@@ -63,10 +66,13 @@ def evaluate(
         data, split=split, kinds=listed(captions), sources=listed(sources) if sources else None
     )
     setting.check(test_set.skeleton)
-    rows = _rows([Path(m) for m in model] if model else [None], preset or ["balanced"], setting)
+    pipelines = _pipelines(model or [])
+    rows = _rows(pipelines, preset or ["balanced"], setting)
     scores = evaluate_rows(rows, test_set, judge, protocol, out, progress=not quiet)
+    clips = [item.features for item in test_set.items[: protocol.clips(len(test_set.items))]]
+    codes = {name: code_statistics(pipeline.decoder, clips) for name, pipeline in pipelines.items()}
     facts = facts_of(test_set, protocol, seconds=time.perf_counter() - started)
-    page = ResultPage(f"Control of {control}, density {density}", facts, scores, judge.caution)
+    page = ResultPage(f"Control of {control}, density {density}", facts, scores, judge.caution, codes)
     page.write(out)
     typer.echo(page.markdown())
 
@@ -76,18 +82,25 @@ def command_line() -> str:
     return shlex.join(["controlmm", *sys.argv[1:]])
 
 
-def _rows(models: list[Path | None], presets: list[str], setting: object) -> list[Row]:
-    from controlmm.evaluation.control_draws import ControlSetting
+def _pipelines(models: Sequence[Path]) -> dict[str, MotionPipeline]:
+    """The pipelines by name: that of their folder, or the kind of the one in the package."""
+    if not models:
+        shipped = load_pipeline(None)
+        return {shipped.kind: shipped}
+    names = [path.resolve().name for path in models]
+    if len(set(names)) < len(names):
+        raise ValueError(f"Model folders must have different names, got {', '.join(names)}.")
+    return {name: load_pipeline(path) for name, path in zip(names, models, strict=True)}
+
+
+def _rows(pipelines: Mapping[str, MotionPipeline], presets: list[str], setting: ControlSetting) -> list[Row]:
     from controlmm.evaluation.motion_sources import Generated, RealMotion, Reconstruction
     from controlmm.evaluation.protocol import Row
     from controlmm.pipelines.presets import resolve_preset
 
-    assert isinstance(setting, ControlSetting)
     plans = {name: resolve_preset(name) for name in presets}
     rows = [Row("real motion", RealMotion(), setting)]
-    for path in models:
-        pipeline = load_pipeline(path)
-        name = pipeline.kind if path is None else path.name
+    for name, pipeline in pipelines.items():
         rows.append(Row(f"{name}, reconstruction", Reconstruction(pipeline), setting))
         rows += [Row(f"{name}, {plan}", Generated(pipeline, plans[plan]), setting) for plan in plans]
     return rows

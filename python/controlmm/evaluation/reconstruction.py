@@ -5,10 +5,14 @@ Source: Guo et al., MoMask, CVPR 2024 (MPJPE as in its evaluation of the tokeniz
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.models.rvq_vae import frame_mask
 
 
@@ -54,6 +58,39 @@ def code_usage(ids: Int[Tensor, "*N Q"], *, codebook_size: int) -> Float[Tensor,
     flat = ids.reshape(-1, ids.shape[-1])
     used = [len(layer[layer >= 0].unique()) for layer in flat.T]
     return torch.tensor(used, dtype=torch.float64) / codebook_size
+
+
+@dataclass(frozen=True, eq=False)
+class CodeStatistics:
+    """How a tokenizer uses its codes on a data set.
+
+    Attributes:
+        codebook_size: Codes of a layer, ``K``.
+        perplexity: (Q,), see :func:`code_perplexity`.
+        usage: (Q,), see :func:`code_usage`.
+    """
+
+    codebook_size: int
+    perplexity: Float[Tensor, "Q"]
+    usage: Float[Tensor, "Q"]
+
+
+@torch.no_grad()
+def code_statistics(decoder: MotionDecoder, clips: Sequence[Float[Tensor, "T D"]]) -> CodeStatistics:
+    """Codes of all ``clips`` (de-normalised features, each cut to whole tokens) taken together.
+
+    For a tokenizer of body parts, layers are parts.
+    """
+    tokenizer, step = decoder.tokenizer, decoder.downsample
+    ids = []
+    for clip in clips:
+        frames = len(clip) // step * step
+        encoded = tokenizer.encode(decoder.normalizer.normalize(clip[None, :frames]))
+        ids.append(encoded[0])
+    size, every = tokenizer.config.codebook_size, torch.cat(ids)
+    return CodeStatistics(
+        size, code_perplexity(every, codebook_size=size), code_usage(every, codebook_size=size)
+    )
 
 
 def _frame_mean(error: Float[Tensor, "B T"], lengths: Int[Tensor, "B"]) -> Float[Tensor, "B"]:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from controlmm.evaluation.intervals import Interval
+from controlmm.evaluation.reconstruction import CodeStatistics
 from controlmm.evaluation.scores import RowScores
 
 RESULTS_MARKDOWN, RESULTS_JSON = "results.md", "results.json"
@@ -83,12 +84,14 @@ class ResultPage:
     facts: Mapping[str, Any]
     rows: Sequence[RowScores]
     caution: str
+    codes: Mapping[str, CodeStatistics] = field(default_factory=dict)  # by tokenizer
 
     def write(self, out: Path) -> None:
         """Write ``results.md`` and ``results.json`` into ``out``."""
         (out / RESULTS_MARKDOWN).write_text(self.markdown(), encoding="utf-8")
         content = {"title": self.title, **self.facts, "caution": self.caution}
         content["rows"] = [row.as_json() for row in self.rows]
+        content["codes"] = {name: _plain_codes(codes) for name, codes in self.codes.items()}
         write_json(out / RESULTS_JSON, content)
 
     def markdown(self) -> str:
@@ -101,7 +104,30 @@ class ResultPage:
                 ("Motion", PHYSICS),
             )
         ]  # fmt: skip
+        if self.codes:
+            tables.append(f"## Codes of the tokenizer\n\n{codes_table(self.codes)}")
         return "\n\n".join([f"# {self.title}", facts, *tables, self.caution]) + "\n"
+
+
+def codes_table(codes: Mapping[str, CodeStatistics]) -> str:
+    """Perplexity and usage of each layer, a line a tokenizer and statistic."""
+    layers = max(len(found.usage) for found in codes.values())
+    cells = []
+    for name, found in codes.items():
+        for title, values in (
+            (f"{name}, perplexity of {found.codebook_size}", [f"{v:.0f}" for v in found.perplexity.tolist()]),
+            (f"{name}, codes in use", [f"{v:.0%}" for v in found.usage.tolist()]),
+        ):
+            cells.append([title, *values, *[""] * (layers - len(values))])
+    return pipe_table(["layer", *map(str, range(layers))], cells)
+
+
+def _plain_codes(codes: CodeStatistics) -> dict[str, Any]:
+    return {
+        "codebook_size": codes.codebook_size,
+        "perplexity": [round(value, 2) for value in codes.perplexity.tolist()],
+        "usage": [round(value, 4) for value in codes.usage.tolist()],
+    }
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
