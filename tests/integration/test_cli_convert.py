@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -28,9 +29,18 @@ def test_a_folder_is_converted_and_every_source_is_named(
     assert f"control               {published / JOINTS / 'model' / 'latest.tar'}" in printed
     assert any(line.startswith(f"{tmp_path / 'model'}: ") and line.endswith(" MB") for line in printed)
     assert sorted(path.name for path in (tmp_path / "model").iterdir()) == [
-        "control", "length", "normalizer.safetensors", "pipeline.json", "residual", "text_encoder.json",
-        "tokenizer", "transformer",
+        "README.md", "control", "length", "normalizer.safetensors", "pipeline.json", "residual",
+        "text_encoder.json", "tokenizer", "transformer",
     ]  # fmt: skip
+
+
+def test_the_card_names_every_file_with_its_hash(command: Command, published: Path, tmp_path: Path) -> None:
+    command("convert", published, "--out", tmp_path / "model")
+    card = (tmp_path / "model" / "README.md").read_text()
+    file = published / RVQ / "model" / "net_best_fid.tar"
+    digest = hashlib.sha256(file.read_bytes()).hexdigest()
+    assert f"| tokenizer | `{RVQ}/model/net_best_fid.tar` | `{digest}` |" in card
+    assert str(tmp_path) not in card.split("- ")[0]
 
 
 def test_the_pelvis_model_can_be_chosen(command: Command, published: Path, tmp_path: Path) -> None:

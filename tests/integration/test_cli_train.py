@@ -20,6 +20,7 @@ from typer.testing import CliRunner
 
 from controlmm.cli.main import app
 from controlmm.motion.motion import Motion
+from controlmm.motion.normalizer import Normalizer
 from controlmm.pipelines import ControlMM
 from controlmm.training import stages
 
@@ -160,6 +161,30 @@ def test_options_of_a_stage_are_set_by_name(root: Path, data: Path, command: Com
     assert told["alpha"] == 0.5  # the published one for such masks
     config = json.loads((tmp_path / "root" / "control" / "best" / "config.json").read_text())
     assert config["into_frozen_trunk"] is False
+
+
+def test_the_weight_of_root_and_contacts_can_be_set(
+    root: Path, data: Path, command: Command, tmp_path: Path
+) -> None:
+    arguments = (
+        "--data",
+        data,
+        "--config",
+        "tiny",
+        "--out",
+        tmp_path / "root",
+        "--steps",
+        1,
+        "--batch-size",
+        2,
+    )
+    command("train", "rvq", *arguments, "--set", "root_contact_bias=5", "--quiet")
+    five = Normalizer.load(tmp_path / "root" / "normalizer.safetensors").std
+    once_25 = Normalizer.load(root / "normalizer.safetensors").std
+    heavier = [0, 1, 2, 3, 259, 260, 261, 262]
+    torch.testing.assert_close(five[heavier], 5 * once_25[heavier])
+    others = [channel for channel in range(263) if channel not in heavier]
+    assert torch.equal(five[others], once_25[others])
 
 
 @pytest.mark.parametrize(

@@ -202,6 +202,21 @@ def test_missing_statistics_and_an_empty_folder_are_named(published, tmp_path):
         convert([tmp_path / "nowhere"], tmp_path / "model")
 
 
+def test_statistics_that_are_no_plain_arrays_are_refused(published, tmp_path):
+    import numpy as np
+
+    file = published / RVQ / "meta" / "std.npy"
+    np.save(file, np.array([{"a": 1}], dtype=object))
+    with pytest.raises(ValueError, match=r"std\.npy is no plain array of numbers, or is damaged"):
+        convert([published], tmp_path / "model")
+    np.save(file, np.ones(10))
+    with pytest.raises(ValueError, match=r"meta holds no feature statistics: `mean` and `std` must both be"):
+        convert([published], tmp_path / "model")
+    np.save(file, np.arange(263))
+    with pytest.raises(ValueError, match=r"std\.npy must hold floating-point numbers"):
+        convert([published], tmp_path / "model")
+
+
 def test_two_runs_for_one_network_are_named(published, tmp_path):
     write_run(
         published / "tres_other", "latest.tar", {"res_transformer": random_state(residual_shapes(SMALL), 9)}

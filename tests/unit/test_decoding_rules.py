@@ -22,6 +22,8 @@ from controlmm.generation.masked_decoding import (
 from controlmm.generation.noise import ClipNoise
 from controlmm.generation.objective import ControlObjective, control_error
 from controlmm.generation.solvers import Stopping, gradient_descent
+from controlmm.ops import obstacle_loss
+from controlmm.ops.obstacles import Sphere
 from controlmm.pipelines import PRESETS, Preset
 
 EXACT = 1e-6
@@ -273,6 +275,29 @@ def test_final_tokens_are_a_mixture_or_codes_drawn_with_their_probability(tiny_p
     mean = 0.25 * tokenizer.base_codes[3] + 0.75 * tokenizer.base_codes[7]
     torch.testing.assert_close(final_latents(tokenizer, logits, layers, soft)[0, 0], mean)
     assert torch.equal(final_latents(tokenizer, logits, layers, drawn), tokenizer.base_codes[ids])
+
+
+# --- row 14: the obstacle loss ---
+
+
+def test_the_obstacle_sum_is_the_papers_but_for_a_constant_and_the_mean_is_the_codes():
+    """Two spheres, three frames, two joints; -min(SDF, d) = max(0, d - SDF) - d in each of the 12 cases."""
+    joints = torch.randn(1, 3, 2, 3, generator=torch.Generator().manual_seed(3))
+    spheres = [Sphere(center=(0.2, 0.1, 0.0), radius=0.9), Sphere(center=(-0.5, 0.0, 0.3), radius=0.6)]
+    distances = torch.stack(
+        [
+            (joints - torch.tensor(c)).norm(dim=-1) - r
+            for c, r in (((0.2, 0.1, 0.0), 0.9), ((-0.5, 0.0, 0.3), 0.6))
+        ]
+    )
+    margin = 0.25
+    paper = -distances.clamp(max=margin).sum()
+    ours = obstacle_loss(joints, spheres, margin=margin, reduction="sum")
+    torch.testing.assert_close(ours[0], paper + 12 * margin, rtol=1e-5, atol=EXACT)
+    code = (-distances[:, ..., 1]).clamp(min=0).mean()  # margin 0, one joint, mean over frames and spheres
+    torch.testing.assert_close(
+        obstacle_loss(joints, spheres, joint_indices=[1])[0], code, rtol=1e-5, atol=EXACT
+    )
 
 
 # --- row 20 and the class of padding in residual layers ---

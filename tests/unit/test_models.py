@@ -334,3 +334,25 @@ def test_the_hint_enters_the_frozen_trunk_only_if_it_should(masked, into_frozen_
     signal = torch.randn(1, 12, config.signal_dim, generator=torch.Generator().manual_seed(1))
     changed = not torch.equal(branch(masked, sequence, signal, valid), masked.logits(sequence, valid))
     assert changed == into_frozen_trunk
+
+
+@pytest.mark.parametrize("layers", [6, 7])
+def test_six_quantisers_or_six_beside_the_base(layers):
+    """ "6 residual layers" reads as seven in all; the published weights have six."""
+    tokenizer = RvqVae(replace(RvqVaeConfig.tiny(), num_quantizers=layers)).eval()
+    residual = ResidualTransformer(replace(ResidualTransformerConfig.tiny(), num_quantizers=layers)).eval()
+    ids = tokenizer.encode(torch.randn(1, 8, 263))
+    assert ids.shape == (1, 2, layers)
+    last = torch.tensor([layers - 1])
+    history = residual.history(ids, last)
+    logits = residual(history, last, torch.ones(1, 64), torch.ones(1, 2, dtype=torch.bool))
+    assert logits.shape == (1, 2, 33)
+
+
+@pytest.mark.parametrize("token_dim", [384, 512])
+def test_token_embeddings_have_the_trunks_width_or_the_codes(token_dim):
+    config = replace(MaskedTransformerConfig.paper(), token_dim=token_dim, layers=1)
+    network = MaskedTransformer(config)
+    ids = torch.zeros(1, 3, dtype=torch.long)
+    assert network.embed(ids).shape == (1, 3, token_dim)
+    assert network.sequence(network.embed(ids), torch.ones(1, 512)).shape == (1, 4, 384)

@@ -366,6 +366,10 @@ def test_unknown_options_and_values_are_named(given, message):
 @pytest.mark.parametrize(
     ("options", "changes", "message"),
     [
+        (ControlOptions, {"masks": "all"}, r"`masks` must be one of .*, got 'all'"),
+        (ControlOptions, {"sampling": "hard"}, r"`sampling` must be one of .*, got 'hard'"),
+        (ControlOptions, {"norm": "huber"}, r"`norm` must be one of .*, got 'huber'"),
+        (MaskedOptions, {"loss_on": "some"}, r"`loss_on` must be 'all' or 'chosen', got 'some'"),
         (ControlOptions, {"alpha": 1.5}, r"`alpha` must be in \[0, 1\], got 1\.5"),
         (ControlOptions, {"share_of": 0}, r"`share_of` must be at least 1"),
         (MaskedOptions, {"embed_loss_weight": 2.0}, r"`embed_loss_weight` must be in \[0, 1\]"),

@@ -58,6 +58,7 @@ def convert(paths: Sequence[Path], out: Path, *, control: ControlKind | None = N
             network.save_pretrained(folder / name)
         normalizer.save(folder / files.NORMALIZER_FILE)
         files.write_json(folder / files.TEXT_ENCODER_FILE, {"kind": "clip", "dim": CLIP_DIM})
+        (folder / "README.md").write_text(report.card(), encoding="utf-8")
         files.write_json(folder / files.PIPELINE_FILE, {"kind": ControlMM.kind, "format": files.FORMAT})
     return report
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
 
 @dataclass
 class ConversionReport:
-    """For people to read: the command prints it, the model card keeps it."""
+    """For people to read: the command prints it, and the model folder keeps a card of it."""
 
     out: Path
     used: dict[str, Path] = field(default_factory=dict)  # role of a network -> file it came from
@@ -19,3 +20,27 @@ class ConversionReport:
         width = max(map(len, self.used), default=0)
         taken = [f"{role:<{width}}  {path}" for role, path in self.used.items()]
         return taken + [f"note: {note}" for note in self.notes]
+
+    def card(self) -> str:
+        """A README for the model folder: every network's file with its hash, and the notes."""
+        rows = [
+            f"| {role} | `{'/'.join(path.parts[-3:])}` | `{_sha256(path)}` |"
+            for role, path in self.used.items()
+        ]
+        lines = [
+            "# A converted model",
+            "",
+            "Made by `controlmm convert` from published checkpoints. The weights keep their files' licence.",
+            "",
+            "| network | file | SHA-256 |",
+            "| --- | --- | --- |",
+            *rows,
+            "",
+            *(f"- {note}" for note in self.notes),
+        ]
+        return "\n".join(lines) + "\n"
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

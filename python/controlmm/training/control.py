@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from torch import Tensor
@@ -46,6 +46,9 @@ class ControlOptions:
     share_of: int | None = None  # as in `MaskedOptions`
 
     def __post_init__(self) -> None:
+        for name, kind in (("masks", MaskMode), ("sampling", Sampling), ("norm", Norm)):
+            if getattr(self, name) not in get_args(kind):
+                raise ValueError(f"`{name}` must be one of {get_args(kind)}, got {getattr(self, name)!r}.")
         if self.alpha is not None and not 0 <= self.alpha <= 1:
             raise ValueError(f"`alpha` must be in [0, 1], got {self.alpha}.")
         if self.share_of is not None and self.share_of < 1:

@@ -50,6 +50,8 @@ class MaskedOptions:
     )
 
     def __post_init__(self) -> None:
+        if self.loss_on not in ("all", "chosen"):
+            raise ValueError(f"`loss_on` must be 'all' or 'chosen', got {self.loss_on!r}.")
         if not 0 <= self.embed_loss_weight <= 1 or not self.logit_noise_std >= 0:
             raise ValueError(
                 "`embed_loss_weight` must be in [0, 1] and `logit_noise_std` not negative, got "
