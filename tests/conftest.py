@@ -13,12 +13,14 @@ from controlmm.data import Caption, Clip, write_folder
 from controlmm.models.control_branch import ControlBranch, ControlBranchConfig
 from controlmm.models.masked_transformer import MaskedTransformer, MaskedTransformerConfig
 from controlmm.models.motion_text_matcher import MatcherConfig, MotionTextMatcher
+from controlmm.models.part_vq_vae import PartVqVae, PartVqVaeConfig
 from controlmm.models.residual_transformer import ResidualTransformer, ResidualTransformerConfig
 from controlmm.models.rvq_vae import RvqVae, RvqVaeConfig
+from controlmm.models.trajectory_transformer import TrajectoryTransformer, TrajectoryTransformerConfig
 from controlmm.motion.features import canonicalize, joints_to_features
 from controlmm.motion.normalizer import ROOT_CONTACT_BIAS, Normalizer, biased_std, channel_statistics
 from controlmm.motion.skeleton import HUMANML3D
-from controlmm.pipelines import ControlMM
+from controlmm.pipelines import ControlMM, TLControl
 from controlmm.text.hashing import HashingTextEncoder
 
 STRIDE = 22  # frames of two steps
@@ -133,6 +135,38 @@ def _amplify(decoder: torch.nn.Module) -> None:
     for module in decoder.modules():
         if isinstance(module, torch.nn.Conv1d):
             torch.nn.init.kaiming_normal_(module.weight)
+
+
+def make_tiny_tlcontrol() -> TLControl:
+    """An untrained TLControl of tiny networks; its codebooks hold seeded random codes."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(6)
+        tokenizer = PartVqVae(PartVqVaeConfig.tiny())
+        for part in range(tokenizer.config.num_parts):
+            tokenizer.quantizer.book(part).codes.normal_()
+        _amplify(tokenizer.decoder)
+        transformer = TrajectoryTransformer(TrajectoryTransformerConfig.tiny())
+        for out in transformer.to_codes:
+            out.weight.data.mul_(DECIDED)
+        transformer.text_proj.weight.data.mul_(DECIDED)
+    return TLControl(
+        tokenizer=tokenizer,
+        transformer=transformer,
+        normalizer=synthetic_normalizer(),
+        text_encoder=HashingTextEncoder(64),
+    )
+
+
+@pytest.fixture
+def tiny_tlcontrol() -> TLControl:
+    """See :func:`make_tiny_tlcontrol`."""
+    return make_tiny_tlcontrol()
+
+
+@pytest.fixture
+def tiny_tlcontrol_folder(tmp_path: Path) -> Path:
+    """The tiny TLControl as written by ``save_pretrained``."""
+    return make_tiny_tlcontrol().save_pretrained(tmp_path / "tlcontrol")
 
 
 @pytest.fixture

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
         save_controls,
     )
     from controlmm.motion.motion import Motion
-    from controlmm.pipelines import ControlMM, GenerationResult
+    from controlmm.pipelines import ControlMM, GenerationResult, TLControl
 
 try:
     __version__ = version("controlmm")
@@ -49,6 +49,7 @@ _HOME_OF = {
     "Plane": "controlmm.controls",
     "PoseControl": "controlmm.controls",
     "Sphere": "controlmm.controls",
+    "TLControl": "controlmm.pipelines",
     "TimelineEntry": "controlmm.controls",
     "load_controls": "controlmm.controls",
     "save_controls": "controlmm.controls",
@@ -69,6 +70,7 @@ __all__ = [
     "Plane",
     "PoseControl",
     "Sphere",
+    "TLControl",
     "TimelineEntry",
     "__version__",
     "load_controls",

@@ -136,7 +136,7 @@ def test_the_published_transformer_recipe_sees_padded_clips_and_weighs_the_recon
     samplers = [TokenSampler(every, normalizer, tokenizer.eval(), features, progress=False) for _ in range(2)]
     config = TrajectoryTransformerConfig.tiny()
     config = type(config)(**{**vars(config), "form": "published"})
-    recipe = tl_mtt.TrajectoryRecipe(config, tokenizer, normalizer, *samplers, curriculum=4)
+    recipe = tl_mtt.TrajectoryRecipe(config, tokenizer, normalizer, *samplers)
     assert recipe.masking == "paper"
     shapes = []
     recipe.model.register_forward_hook(lambda _, arguments, output: shapes.append(output.shape))

@@ -1,14 +1,16 @@
-"""``controlmm assemble``: four trained stages in, one model folder out."""
+"""``controlmm assemble``: trained stages in, one model folder out."""
 
 from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 if TYPE_CHECKING:
+    from controlmm.models.length_estimator import LengthEstimator
+    from controlmm.pipelines.pipeline import MotionPipeline
     from controlmm.text import TextEncoder
 
 
@@ -27,12 +29,25 @@ def assemble(
     """Put the best weights of the stages together, to generate with."""
     import torch
 
+    from controlmm.training.run_folder import SETTINGS_FILE
+
+    encoder = _text_encoder(root, text, text_folder)
+    pipeline, stages = (_tlcontrol if (root / "tl-mtt").is_dir() else _controlmm)(root, encoder)
+    pipeline.save_pretrained(out, dtype=torch.float16 if half else torch.float32)
+    for network, stage in stages.items():
+        if (root / stage / SETTINGS_FILE).is_file():  # not there when a stage came from a model without it
+            shutil.copyfile(root / stage / SETTINGS_FILE, out / network / SETTINGS_FILE)
+    size = sum(file.stat().st_size for file in out.rglob("*") if file.is_file()) / 1e6
+    typer.echo(f"{out}: {size:.1f} MB, {pipeline.num_parameters / 1e6:.2f} million parameters")
+    typer.echo(f'Next: controlmm generate "a person walks forward" --model {out}')
+
+
+def _controlmm(root: Path, encoder: TextEncoder) -> tuple[MotionPipeline[Any], dict[str, str]]:
+    """The pipeline, and the stage that each network's folder comes from."""
     from controlmm.models.control_branch import ControlBranch
-    from controlmm.models.length_estimator import LengthEstimator
     from controlmm.models.masked_transformer import MaskedTransformer
     from controlmm.models.residual_transformer import ResidualTransformer
     from controlmm.pipelines import ControlMM
-    from controlmm.training.run_folder import SETTINGS_FILE
     from controlmm.training.stage import load_tokenizer, tokenizer_stage
 
     tokenizer, normalizer = load_tokenizer(root)
@@ -42,10 +57,9 @@ def assemble(
         residual=ResidualTransformer.from_pretrained(_best(root, "residual")),
         control=ControlBranch.from_pretrained(_best(root, "control")),
         normalizer=normalizer,
-        text_encoder=_text_encoder(root, text, text_folder),
-        length=LengthEstimator.from_pretrained(_best(root, "length")) if (root / "length").is_dir() else None,
+        text_encoder=encoder,
+        length=_length(root),
     )
-    pipeline.save_pretrained(out, dtype=torch.float16 if half else torch.float32)
     stages = {
         "tokenizer": tokenizer_stage(root),
         "transformer": "masked",
@@ -53,12 +67,30 @@ def assemble(
         "control": "control",
         "length": "length",
     }
-    for network, stage in stages.items():
-        if (root / stage / SETTINGS_FILE).is_file():  # not there when a stage came from a model without it
-            shutil.copyfile(root / stage / SETTINGS_FILE, out / network / SETTINGS_FILE)
-    size = sum(file.stat().st_size for file in out.rglob("*") if file.is_file()) / 1e6
-    typer.echo(f"{out}: {size:.1f} MB, {pipeline.num_parameters / 1e6:.2f} million parameters")
-    typer.echo(f'Next: controlmm generate "a person walks forward" --model {out}')
+    return pipeline, stages
+
+
+def _tlcontrol(root: Path, encoder: TextEncoder) -> tuple[MotionPipeline[Any], dict[str, str]]:
+    from controlmm.models.part_vq_vae import PartVqVae
+    from controlmm.models.trajectory_transformer import TrajectoryTransformer
+    from controlmm.motion.normalizer import Normalizer
+    from controlmm.pipelines import TLControl
+    from controlmm.training.stage import NORMALIZER_FILE
+
+    pipeline = TLControl(
+        tokenizer=PartVqVae.from_pretrained(_best(root, "tl-vq")),
+        transformer=TrajectoryTransformer.from_pretrained(_best(root, "tl-mtt")),
+        normalizer=Normalizer.load(root / NORMALIZER_FILE),
+        text_encoder=encoder,
+        length=_length(root),
+    )
+    return pipeline, {"tokenizer": "tl-vq", "transformer": "tl-mtt", "length": "length"}
+
+
+def _length(root: Path) -> LengthEstimator | None:
+    from controlmm.models.length_estimator import LengthEstimator
+
+    return LengthEstimator.from_pretrained(_best(root, "length")) if (root / "length").is_dir() else None
 
 
 def _best(root: Path, stage: str) -> Path:

@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -82,8 +82,10 @@ def command_line() -> str:
     return shlex.join(["controlmm", *sys.argv[1:]])
 
 
-def _pipelines(models: Sequence[Path]) -> dict[str, MotionPipeline]:
+def _pipelines(models: Sequence[Path]) -> dict[str, MotionPipeline[Any]]:
     """The pipelines by name: that of their folder, or the kind of the one in the package."""
+    from controlmm.pipelines.loading import load_pipeline
+
     if not models:
         shipped = load_pipeline(None)
         return {shipped.kind: shipped}
@@ -93,24 +95,20 @@ def _pipelines(models: Sequence[Path]) -> dict[str, MotionPipeline]:
     return {name: load_pipeline(path) for name, path in zip(names, models, strict=True)}
 
 
-def _rows(pipelines: Mapping[str, MotionPipeline], presets: list[str], setting: ControlSetting) -> list[Row]:
+def _rows(
+    pipelines: Mapping[str, MotionPipeline[Any]], presets: list[str], setting: ControlSetting
+) -> list[Row]:
     from controlmm.evaluation.motion_sources import Generated, RealMotion, Reconstruction
     from controlmm.evaluation.protocol import Row
-    from controlmm.pipelines.presets import resolve_preset
 
-    plans = {name: resolve_preset(name) for name in presets}
     rows = [Row("real motion", RealMotion(), setting)]
     for name, pipeline in pipelines.items():
         rows.append(Row(f"{name}, reconstruction", Reconstruction(pipeline), setting))
-        rows += [Row(f"{name}, {plan}", Generated(pipeline, plans[plan]), setting) for plan in plans]
+        rows += [
+            Row(f"{name}, {preset}", Generated(pipeline, pipeline.resolve_preset(preset, None)), setting)
+            for preset in presets
+        ]
     return rows
-
-
-def load_pipeline(path: Path | None) -> MotionPipeline:
-    """The pipeline in a model folder, of whatever kind it is."""
-    from controlmm.pipelines import ControlMM
-
-    return ControlMM.from_pretrained(path)
 
 
 def facts_of(test_set: TestSet, protocol: Protocol, *, seconds: float) -> dict[str, object]:

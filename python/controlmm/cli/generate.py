@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -42,13 +42,18 @@ def generate(
     ] = None,
     preset: Annotated[str, typer.Option(help="fast, balanced or accurate.")] = "balanced",
     samples: Annotated[int, typer.Option(help="Number of motions.")] = 1,
+    vary: Annotated[
+        str | None,
+        typer.Option(help="Body part that samples differ in, such as left_arm (TLControl)."),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Same seed, same motions.")] = 0,
     formats: Annotated[
         str, typer.Option(help="Files to write, comma-separated: npz, npy, bvh, png, gif, mp4.")
     ] = "npz,bvh,png",
     out: Annotated[Path, typer.Option(help="Folder for the files; is made.")] = Path("out"),
     model: Annotated[
-        Path | None, typer.Option(help="Model folder. By default the model that comes with the package.")
+        Path | None,
+        typer.Option(help="Model folder, or controlmm or tlcontrol, which come with the package."),
     ] = None,
     guidance: Annotated[
         float | None,
@@ -66,9 +71,12 @@ def generate(
     seconds = _chosen_seconds(seconds, document, controls)
     avoided = all_obstacles(document, obstacles)
 
-    from controlmm.pipelines import ControlMM
+    from controlmm.pipelines import TLControl, load_pipeline
 
-    pipeline = ControlMM.from_pretrained(model)
+    pipeline = load_pipeline(model)
+    if vary is not None and not isinstance(pipeline, TLControl):
+        raise ValueError("`--vary` needs a TLControl model, for example: --model tlcontrol.")
+    parts: dict[str, Any] = {} if vary is None else {"vary": vary}
     with PhaseBars(enabled=not quiet) as bars:
         result = pipeline(
             prompt,
@@ -80,6 +88,7 @@ def generate(
             guidance_scale=guidance,
             seed=seed,
             progress=bars,
+            **parts,
         )
     stem = f"{slug(prompt)}_{seed}"
     files = [

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from torch import nn
 
 from controlmm.convert.options_file import Options, number
 from controlmm.convert.renaming import Rule, count_indices, load_strictly, renamed, weight
@@ -65,9 +66,9 @@ def import_rvq(state: StateDict, options: Options) -> RvqVae:
     )
     network = RvqVae(config)
     weights = renamed(
-        state, [*encoder_rules("encoder", stages), *_decoder_rules(stages), *_book_rules(is_shared)]
+        state, [*encoder_rules("encoder", stages), *decoder_rules(stages), *_book_rules(is_shared)]
     )
-    load_strictly(network, weights | _codebook_state(network, weights), what=what)
+    load_strictly(network, weights | codebook_state(network, weights), what=what)
     return network.eval()
 
 
@@ -150,7 +151,8 @@ def encoder_rules(published: str, stages: int, *, ours: str = "encoder") -> list
     return rules
 
 
-def _decoder_rules(stages: int) -> list[Rule]:
+def decoder_rules(stages: int) -> list[Rule]:
+    """Rules for the convolutional decoder."""
     rules = [
         (r"decoder\.model\.0\.(.+)", r"decoder.entry.\1"),
         (rf"decoder\.model\.{2 + stages}\.(.+)", r"decoder.smooth.\1"),
@@ -176,7 +178,7 @@ def _book_rules(is_shared: bool) -> list[Rule]:
     return [(r"quantizer\.layers\.(\d+)\.codebook", r"quantizer.books.\1.codes")]
 
 
-def _codebook_state(network: RvqVae, weights: StateDict) -> StateDict:
+def codebook_state(network: nn.Module, weights: StateDict) -> StateDict:
     """Running sums that published files leave out: as after the first batch, so training can go on."""
     state: StateDict = {}
     for name, value in network.state_dict().items():

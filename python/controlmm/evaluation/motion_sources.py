@@ -16,7 +16,6 @@ from controlmm.evaluation.test_set import MAX_FRAMES, Sample
 from controlmm.models.rvq_vae import frame_mask
 from controlmm.ops import recover_joints
 from controlmm.pipelines.pipeline import MotionPipeline
-from controlmm.pipelines.presets import Preset
 from controlmm.text.encoder import weights_sha256
 
 
@@ -98,7 +97,7 @@ class RealMotion:
 class Reconstruction:
     """Recordings after the pipeline's tokenizer: what generation can reach at best."""
 
-    def __init__(self, pipeline: MotionPipeline) -> None:
+    def __init__(self, pipeline: MotionPipeline[Any]) -> None:
         self._decoder = pipeline.decoder
 
     def describe(self) -> dict[str, Any]:
@@ -118,9 +117,9 @@ class Reconstruction:
 
 
 class Generated:
-    """A pipeline's motions under one preset."""
+    """A pipeline's motions under one of its presets."""
 
-    def __init__(self, pipeline: MotionPipeline, preset: Preset) -> None:
+    def __init__(self, pipeline: MotionPipeline[Any], preset: Any) -> None:
         self.pipeline, self.preset = pipeline, preset
 
     def describe(self) -> dict[str, Any]:

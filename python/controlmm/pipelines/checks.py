@@ -14,8 +14,11 @@ from controlmm.controls import Objective
 from controlmm.models.control_branch import ControlBranchConfig
 from controlmm.models.length_estimator import LengthEstimatorConfig
 from controlmm.models.masked_transformer import MaskedTransformerConfig
+from controlmm.models.part_vq_vae import PartVqVaeConfig
 from controlmm.models.residual_transformer import ResidualTransformerConfig
 from controlmm.models.rvq_vae import RvqVaeConfig
+from controlmm.models.trajectory_transformer import TrajectoryTransformerConfig
+from controlmm.motion.body_parts import trajectory_joints
 from controlmm.motion.skeleton import Skeleton
 
 MIN_FRAMES = 8
@@ -123,3 +126,27 @@ def check_sizes(
             f"`joints` of `control` must be below {skeleton.num_joints} for the {skeleton.name} skeleton, "
             f"got {max(control.joints)}."
         )
+
+
+def check_tlcontrol_sizes(
+    *,
+    tokenizer: PartVqVaeConfig,
+    transformer: TrajectoryTransformerConfig,
+    skeleton: Skeleton,
+    text_dim: int,
+    length: LengthEstimatorConfig | None = None,
+) -> None:
+    """Raise ``ValueError`` unless TLControl's networks, statistics and text encoder fit each other."""
+    is_published = tokenizer.latent_norm == "clip"
+    for name, part, wanted, found in (
+        ("feature_dim", "tokenizer", skeleton.feature_dim, tokenizer.feature_dim),
+        ("codebook_size", "transformer", tokenizer.codebook_size, transformer.codebook_size),
+        ("num_parts", "transformer", tokenizer.num_parts, transformer.num_parts),
+        ("downsample", "transformer", tokenizer.downsample, transformer.downsample),
+        ("joints", "transformer", trajectory_joints(skeleton), transformer.joints),
+        ("form", "transformer", "published" if is_published else "masked", transformer.form),
+        ("text_dim", "transformer", text_dim, transformer.text_dim),
+        ("text_dim", "length", text_dim, text_dim if length is None else length.text_dim),
+    ):
+        if wanted != found:
+            raise ValueError(f"The parts do not fit: `{name}` of `{part}` must be {wanted}, got {found}.")

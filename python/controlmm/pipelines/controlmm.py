@@ -35,11 +35,11 @@ from controlmm.nn.checkpoint import PretrainedModel
 from controlmm.pipelines import folder as files
 from controlmm.pipelines.checks import check_masks_end, check_sizes
 from controlmm.pipelines.pipeline import MotionPipeline
-from controlmm.pipelines.presets import Preset
+from controlmm.pipelines.presets import Preset, resolve_preset
 from controlmm.text import TextEncoder, check_same_encoder, load_text_encoder
 
 
-class ControlMM(MotionPipeline):
+class ControlMM(MotionPipeline[Preset]):
     """Generates motions of the 22 HumanML3D joints from a prompt and spatial controls.
 
     Example:
@@ -121,6 +121,10 @@ class ControlMM(MotionPipeline):
             "control": self.control,
             **({} if self.length is None else {"length": self.length}),
         }
+
+    def resolve_preset(self, preset: str | Preset, guidance_scale: float | None) -> Preset:
+        """See :class:`MotionPipeline`."""
+        return resolve_preset(preset, guidance_scale=guidance_scale)
 
     @torch.no_grad()
     def generate_latents(

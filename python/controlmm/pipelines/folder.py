@@ -9,23 +9,28 @@ from typing import Any
 PIPELINE_FILE, TEXT_ENCODER_FILE = "pipeline.json", "text_encoder.json"
 NORMALIZER_FILE = "normalizer.safetensors"
 FORMAT = 1
-SHIPPED = "small"  # the model in the wheel
+# The models in the wheel: name that a caller may give instead of a folder -> folder in `pretrained`.
+SHIPPED = {"controlmm": "small", "tlcontrol": "tlcontrol"}
 
 
-def shipped_folder(name: str = SHIPPED) -> Path:
-    """Folder of the trained model that comes with the package."""
+def shipped_folder(name: str = SHIPPED["controlmm"]) -> Path:
+    """Folder of a trained model that comes with the package."""
     return Path(__file__).resolve().parents[1] / "pretrained" / name
 
 
-def resolve_folder(path: str | Path | None) -> Path:
-    """The folder to load: ``path``, or the shipped model for ``None``.
+def resolve_folder(path: str | Path | None, *, shipped: str = "controlmm") -> Path:
+    """The folder to load: ``path``, or a shipped model for its name; ``None`` is the name ``shipped``.
 
     Raises:
         FileNotFoundError: If there is no such folder, or it holds no pipeline.
     """
-    folder = shipped_folder() if path is None else Path(path)
+    name = shipped if path is None else str(path)
+    folder = Path(name) if Path(name).is_dir() or name not in SHIPPED else shipped_folder(SHIPPED[name])
     if not folder.is_dir():
-        raise FileNotFoundError(f"No model folder at {folder}. Pass a folder written by `save_pretrained`.")
+        raise FileNotFoundError(
+            f"No model folder at {folder}. Pass a folder written by `save_pretrained`, or the name of a "
+            f"model that comes with the package: {', '.join(SHIPPED)}."
+        )
     if not (folder / PIPELINE_FILE).is_file():
         raise FileNotFoundError(
             f"{folder} holds no pipeline: {PIPELINE_FILE} is missing. Train one with `controlmm train` and "

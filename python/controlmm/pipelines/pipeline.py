@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Generic, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -26,14 +25,16 @@ from controlmm.pipelines import folder as files
 from controlmm.pipelines.checks import check_sampling
 from controlmm.pipelines.length import draw_frames
 from controlmm.pipelines.output import GenerationResult
-from controlmm.pipelines.presets import Preset, resolve_preset
 from controlmm.pipelines.scene import Scene
 from controlmm.text import TextEncoder, check_prompt
 
 MAX_FRAMES = 196
 
 
-class MotionPipeline(ABC):
+_Plan = TypeVar("_Plan")  # a pipeline's kind of preset
+
+
+class MotionPipeline(ABC, Generic[_Plan]):
     """Text plus 3D control in, motions out. A subclass says how the latents of a batch are made."""
 
     kind: ClassVar[str]  # in pipeline.json
@@ -50,7 +51,7 @@ class MotionPipeline(ABC):
         targets: Float[Tensor, "B T J 3"],
         mask: Bool[Tensor, "B T J 3"],
         seeds: Sequence[int],
-        preset: Preset,
+        preset: _Plan,
         terms: Sequence[JointTerm] = (),
         progress: Progress | None = None,
     ) -> Float[Tensor, "B L C"]:
@@ -60,6 +61,15 @@ class MotionPipeline(ABC):
 
         Raises:
             ValueError: If a target lies after the end of its clip.
+        """
+
+    @abstractmethod
+    def resolve_preset(self, preset: str | _Plan, guidance_scale: float | None) -> _Plan:
+        """A preset or the one of that name; ``guidance_scale`` replaces its own unless it is ``None``.
+
+        Raises:
+            TypeError: If it is neither.
+            ValueError: If there is none of that name.
         """
 
     @abstractmethod
@@ -77,7 +87,7 @@ class MotionPipeline(ABC):
         obstacles: Sequence[Obstacle | Avoid] = (),
         objectives: Sequence[Objective] = (),
         samples: int = 1,
-        preset: str | Preset = "balanced",
+        preset: str | _Plan = "balanced",
         guidance_scale: float | None = None,
         seed: int = 0,
         progress: Progress | None = None,
@@ -98,7 +108,7 @@ class MotionPipeline(ABC):
                 one in :class:`Avoid` to choose joints and margin.
             objectives: Differentiable functions of the joints to be made small.
             samples: How many motions; sample ``i`` is the same however many are asked for.
-            preset: ``fast``, ``balanced``, ``accurate`` (the papers' iteration counts) or a :class:`Preset`.
+            preset: ``fast``, ``balanced``, ``accurate`` (the papers' settings), or a preset of one's own.
             guidance_scale: How strongly the text counts; ``None`` takes the preset's.
             seed: Same seed, same motions.
             progress: Called as ``progress(phase, done, total)`` during long loops.
@@ -109,9 +119,7 @@ class MotionPipeline(ABC):
         """
         started = time.perf_counter()
         check_sampling(samples=samples, seed=seed)
-        plan = resolve_preset(preset)
-        if guidance_scale is not None:
-            plan = dataclasses.replace(plan, guidance_scale=guidance_scale)
+        plan = self.resolve_preset(preset, guidance_scale)
         arrange = partial(
             Scene.of_call,
             prompt,
@@ -125,7 +133,7 @@ class MotionPipeline(ABC):
             arrange(seconds=None, frames=MAX_FRAMES)  # an unusable call is refused before any network runs
             frames = self._drawn_frames(self.length, prompt, controls, seed)
         scene = arrange(seconds=seconds, frames=frames)
-        canonical, step = scene.canonical, self.decoder.downsample
+        canonical = scene.canonical
         latents = self.generate_latents(
             self.text_encoder.encode([scene.prompt]).pooled.expand(samples, -1),
             lengths=[scene.frames] * samples,
@@ -133,11 +141,16 @@ class MotionPipeline(ABC):
             mask=canonical.mask.expand(samples, -1, -1, -1),
             seeds=clip_seeds(seed, samples),
             preset=plan,
-            terms=scene.terms(samples, padded=-(-scene.frames // step) * step, skeleton=self.skeleton),
+            terms=scene.terms(samples, padded=self.padded_frames(scene.frames), skeleton=self.skeleton),
             progress=progress,
         )
         features = self.decoder.features(latents)[:, : scene.frames]
         return scene.result(features, latents, seconds_taken=time.perf_counter() - started)
+
+    def padded_frames(self, frames: int) -> int:
+        """Frames that the networks work on for a motion of ``frames``: whole tokens."""
+        step = self.decoder.downsample
+        return -(-frames // step) * step
 
     def _drawn_frames(
         self, estimator: LengthEstimator, prompt: str, controls: Sequence[Control], seed: int

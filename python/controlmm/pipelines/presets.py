@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from controlmm.generation.decoding_rules import DecodingRules
 from controlmm.generation.editing import EditingBudget
@@ -40,13 +40,18 @@ PRESETS = {
 }
 
 
-def resolve_preset(preset: str | Preset) -> Preset:
-    """``preset`` itself, or the one of that name.
+def resolve_preset(preset: str | Preset, *, guidance_scale: float | None = None) -> Preset:
+    """``preset`` itself, or the one of that name; with another ``guidance_scale`` if one is given.
 
     Raises:
         TypeError: If it is neither.
-        ValueError: If there is none of that name.
+        ValueError: If there is none of that name, or the scale is no number.
     """
+    plan = _resolved(preset)
+    return plan if guidance_scale is None else replace(plan, guidance_scale=guidance_scale)
+
+
+def _resolved(preset: str | Preset) -> Preset:
     if isinstance(preset, Preset):
         return preset
     if not isinstance(preset, str):

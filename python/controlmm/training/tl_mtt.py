@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -47,6 +48,15 @@ SETTINGS = {
 }
 
 
+@dataclass(frozen=True)
+class TrajectoryOptions:
+    """What may be chosen beside the network's sizes."""
+
+    # "auto": "paper" for networks of the published form, else "mixed", see `given_coordinates`
+    masking: Literal["auto", "mixed", "paper", "released"] = "auto"
+    curriculum: int = _PAPER_STEPS  # batches until the published strategies hide most
+
+
 class TrajectoryRecipe:
     """Cross-entropy of the codes, and reconstruction of the motion decoded from codes drawn by Gumbel noise.
 
@@ -63,15 +73,15 @@ class TrajectoryRecipe:
         train_tokens: TokenSampler,
         val_tokens: TokenSampler,
         *,
-        masking: Masking | None = None,
-        curriculum: int = _PAPER_STEPS,
+        options: TrajectoryOptions = TrajectoryOptions(),
     ) -> None:
         self.model = TrajectoryTransformer(config)
         self.tokenizer = tokenizer.eval().requires_grad_(False)
         self.normalizer = normalizer
         self.is_published = config.form == "published"
-        self.masking: Masking = masking or ("paper" if self.is_published else "mixed")
-        self.curriculum = curriculum  # batches until the published strategies hide most
+        automatic: Masking = "paper" if self.is_published else "mixed"
+        self.masking: Masking = automatic if options.masking == "auto" else options.masking
+        self.curriculum = options.curriculum
         self._train, self._val = train_tokens, val_tokens
 
     def loss(self, batch_size: int) -> dict[str, Tensor]:
@@ -186,11 +196,21 @@ def _build(config: TrajectoryTransformerConfig, inputs: StageInputs) -> Recipe:
     tokenizer = PartVqVae.from_pretrained(best_weights(inputs.root, "tl-vq"))
     normalizer = Normalizer.load(inputs.root / NORMALIZER_FILE)
     config = config.for_text(inputs.text_encoder.dim).for_skeleton(normalizer.skeleton)
-    recipe = TrajectoryRecipe(config, tokenizer, normalizer, *inputs.token_samplers(tokenizer))
+    recipe = TrajectoryRecipe(
+        config, tokenizer, normalizer, *inputs.token_samplers(tokenizer), options=inputs.options
+    )
     mean, std = trajectory_statistics(inputs.train_clips, normalizer, config.joints)
     recipe.model.trajectory_mean.copy_(mean)
     recipe.model.trajectory_std.copy_(std)
     return recipe
 
 
-STAGE = Stage("tl-mtt", _build, by_size(TrajectoryTransformerConfig), SETTINGS, ("tl-vq",))
+STAGE = Stage(
+    "tl-mtt",
+    _build,
+    by_size(TrajectoryTransformerConfig),
+    SETTINGS,
+    ("tl-vq",),
+    network="transformer",
+    options=TrajectoryOptions(),
+)

@@ -11,4 +11,5 @@ STAGE = Stage(
     {size: config.unsplit() for size, config in tl_vq.STAGE.configs.items()},
     tl_vq.SETTINGS,
     uses_text=False,
+    starts_from_weights=False,
 )

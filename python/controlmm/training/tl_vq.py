@@ -112,4 +112,12 @@ def _build(config: PartVqVaeConfig, inputs: StageInputs) -> Recipe:
     return PartVqRecipe(config, normalizer, inputs.train_clips, inputs.val_clips)
 
 
-STAGE = Stage("tl-vq", _build, by_size(PartVqVaeConfig), SETTINGS, uses_text=False)
+STAGE = Stage(
+    "tl-vq",
+    _build,
+    by_size(PartVqVaeConfig),
+    SETTINGS,
+    network="tokenizer",
+    uses_text=False,
+    starts_from_weights=False,
+)

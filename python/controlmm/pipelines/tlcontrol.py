@@ -1,0 +1,270 @@
+"""TLControl: text plus trajectories in, human motion out, by one prediction and an optimisation.
+
+Source: Wan et al., TLControl: Trajectory and Language Control for Human Motion Synthesis, ECCV 2024.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from controlmm.generation.code_sampling import draw_part_codes
+from controlmm.generation.foot_terms import ContactTerm, PublishedFootTerm
+from controlmm.generation.motion_decoder import MotionDecoder
+from controlmm.generation.solvers import LbfgsTolerance, Progress, Solution, Stopping, lbfgs
+from controlmm.generation.terms import JointTerm
+from controlmm.generation.trajectory_objective import Rescaled, trajectory_objective
+from controlmm.models.length_estimator import LengthEstimator
+from controlmm.models.part_vq_vae import PartVqVae
+from controlmm.models.rvq_vae import frame_mask
+from controlmm.models.trajectory_transformer import TrajectoryTransformer
+from controlmm.motion.body_parts import part_index
+from controlmm.motion.normalizer import Normalizer
+from controlmm.nn.checkpoint import PretrainedModel
+from controlmm.pipelines import folder as files
+from controlmm.pipelines.checks import check_masks_end, check_tlcontrol_sizes
+from controlmm.pipelines.output import GenerationResult
+from controlmm.pipelines.pipeline import MotionPipeline
+from controlmm.pipelines.tlcontrol_presets import TLControlPreset, resolve_tlcontrol_preset
+from controlmm.text import TextEncoder, check_same_encoder, load_text_encoder
+
+_METRE = {"m": 1.0, "mm": 1000.0}  # in a skeleton's unit
+_EVALUATIONS_A_STEP = 1.25  # at most, on average: what the released code's L-BFGS may spend
+
+
+class TLControl(MotionPipeline[TLControlPreset]):
+    """Generates motions of the 22 HumanML3D joints from a prompt and spatial controls.
+
+    Takes the same call as :class:`ControlMM`. The networks see the six trajectories (root, head, wrists,
+    feet); what they cannot say (other joints) is left to the optimisation.
+
+    Example:
+        >>> pipeline = TLControl.from_pretrained()
+        >>> result = pipeline("a person walks forward", seconds=4, seed=1)
+        >>> result.best.save("walk.bvh")
+    """
+
+    kind = "tlcontrol"
+
+    def __init__(
+        self,
+        *,
+        tokenizer: PartVqVae,
+        transformer: TrajectoryTransformer,
+        normalizer: Normalizer,
+        text_encoder: TextEncoder,
+        length: LengthEstimator | None = None,
+    ) -> None:
+        check_tlcontrol_sizes(
+            tokenizer=tokenizer.config,
+            transformer=transformer.config,
+            skeleton=normalizer.skeleton,
+            text_dim=text_encoder.dim,
+            length=None if length is None else length.config,
+        )
+        self.length = None if length is None else length.eval().requires_grad_(False)
+        self.tokenizer = tokenizer
+        self.transformer = transformer.eval().requires_grad_(False)
+        self.decoder = MotionDecoder(tokenizer, normalizer)
+        self.text_encoder = text_encoder
+
+    @classmethod
+    def from_pretrained(
+        cls, path: str | Path | None = None, *, text_encoder: TextEncoder | None = None
+    ) -> TLControl:
+        """Load a pipeline folder; without a path, the trained model that comes with the package.
+
+        Args:
+            path: A folder written by :meth:`save_pretrained`.
+            text_encoder: Use this one instead of loading the one that the folder names; it must equal it.
+
+        Raises:
+            FileNotFoundError: If the folder or one of its files is missing.
+            ValueError: If a file is damaged, or the text encoder is not the one used in training.
+            ModuleNotFoundError: If the text encoder's weights are not installed.
+        """
+        folder = files.resolve_folder(path, shipped=cls.kind)
+        files.check_kind(folder, cls.kind)
+        encoder_config = files.read_json(folder / files.TEXT_ENCODER_FILE)
+        if text_encoder is None:
+            text_encoder = load_text_encoder(encoder_config)
+        else:
+            check_same_encoder(encoder_config, text_encoder)
+        return cls(
+            tokenizer=PartVqVae.from_pretrained(folder / "tokenizer"),
+            transformer=TrajectoryTransformer.from_pretrained(folder / "transformer"),
+            normalizer=Normalizer.load(folder / files.NORMALIZER_FILE),
+            text_encoder=text_encoder,
+            length=LengthEstimator.from_pretrained(folder / "length")
+            if (folder / "length").is_dir()
+            else None,
+        )
+
+    def networks(self) -> dict[str, PretrainedModel]:
+        """See :class:`MotionPipeline`."""
+        return {
+            "tokenizer": self.tokenizer,
+            "transformer": self.transformer,
+            **({} if self.length is None else {"length": self.length}),
+        }
+
+    def __call__(
+        self,
+        prompt: str,
+        *,
+        preset: str | TLControlPreset = "balanced",
+        vary: str | None = None,
+        **call: Any,
+    ) -> GenerationResult:
+        """Generate motions; all arguments of :meth:`MotionPipeline.__call__`, and ``vary``.
+
+        Args:
+            prompt: What the person does, in words.
+            preset: ``fast``, ``balanced``, ``accurate`` (tolerances 1e-5, 1e-6, 1e-8), ``paper`` (the most
+                likely codes, the released optimisation) or a :class:`TLControlPreset`.
+            vary: A body part (``root``, ``trunk``, ``left_arm``, ``right_arm``, ``left_leg``, ``right_leg``):
+                samples draw the codes of this part anew and keep the first sample's codes of all others.
+            **call: As for :class:`ControlMM`.
+
+        Raises:
+            TypeError: If an argument has the wrong type; nothing has run then.
+            ValueError: If an argument is unusable; nothing has run then.
+        """
+        plan = resolve_tlcontrol_preset(preset)
+        if vary is not None:
+            plan = dataclasses.replace(plan, vary=vary)
+        return super().__call__(prompt, preset=plan, **call)
+
+    def resolve_preset(self, preset: str | TLControlPreset, guidance_scale: float | None) -> TLControlPreset:
+        """See :class:`MotionPipeline`."""
+        return resolve_tlcontrol_preset(preset, guidance_scale=guidance_scale)
+
+    @torch.no_grad()
+    def generate_latents(
+        self,
+        text: Float[Tensor, "B E"],
+        *,
+        lengths: Sequence[int],
+        targets: Float[Tensor, "B T J 3"],
+        mask: Bool[Tensor, "B T J 3"],
+        seeds: Sequence[int],
+        preset: TLControlPreset,
+        terms: Sequence[JointTerm] = (),
+        progress: Progress | None = None,
+    ) -> Float[Tensor, "B L C"]:
+        """Latents of a batch of clips of different texts, lengths and targets (the networks' frame).
+
+        Clips without any target keep the codes as drawn, unless there are ``terms``.
+
+        Raises:
+            ValueError: If a target lies after the end of its clip.
+        """
+        check_masks_end(mask, lengths)
+        valid = self._valid_tokens(lengths)
+        targets, mask = (_padded(x, valid.shape[1] * self.decoder.downsample) for x in (targets, mask))
+        latents = self._predicted(text, valid, targets, mask, seeds, preset)
+        is_edited = mask.flatten(1).any(1) | bool(terms)
+        rows = is_edited.nonzero()[:, 0]
+        if preset.iterations and len(rows):
+            chosen = [term.select(rows) for term in terms]
+            edited = self.optimize(
+                latents[rows], valid[rows], targets[rows], mask[rows], preset, terms=chosen, progress=progress
+            )
+            latents[rows] = edited.latents
+        return latents
+
+    def optimize(
+        self,
+        latents: Float[Tensor, "B L C"],
+        valid: Bool[Tensor, "B L"],
+        targets: Float[Tensor, "B T J 3"],
+        mask: Bool[Tensor, "B T J 3"],
+        preset: TLControlPreset,
+        *,
+        terms: Sequence[JointTerm] = (),
+        progress: Progress | None = None,
+    ) -> Solution:
+        """Test-time optimisation of the continuous codes in front of the frozen decoder (section 3.3).
+
+        Args:
+            latents: Where to start: the predicted codes.
+            valid: Tokens of each clip.
+            targets: Metres, the networks' frame, padded to whole tokens.
+            mask: The controlled coordinates.
+            preset: Tolerance, limits and forms of the loss.
+            terms: Minimised beside the distance.
+            progress: Called after every evaluation.
+        """
+        frames = valid.repeat_interleave(self.decoder.downsample, dim=1)
+        every_term = [*terms, *self._foot_terms(latents, frames, mask, preset)]
+        objective = trajectory_objective(preset.loss, self.decoder, targets, mask, frames, terms=every_term)
+        limit = max(1, round(_EVALUATIONS_A_STEP * preset.iterations))
+        unit = self._latent_unit
+        solution = lbfgs(
+            Rescaled(objective, unit=unit),
+            latents / unit,
+            valid[..., None].float(),
+            Stopping(iterations=preset.iterations, evaluations=limit),
+            rate=preset.rate,
+            history=preset.history,
+            tolerance=LbfgsTolerance(change=preset.tolerance * _METRE[self.skeleton.unit] ** 2),
+            progress=progress,
+        )
+        return dataclasses.replace(solution, latents=solution.latents * unit)
+
+    @property
+    def _latent_unit(self) -> float:
+        """What a published latent is in ours: there a part has norm 1 over a clip of the longest length."""
+        config = self.tokenizer.config
+        if config.latent_norm == "clip":
+            return 1.0
+        return math.sqrt(config.code_dim * self.transformer.config.max_tokens)
+
+    def padded_frames(self, frames: int) -> int:
+        """See :class:`MotionPipeline`; networks of the published form always work on their full length."""
+        if self.tokenizer.config.latent_norm == "clip":
+            return self.transformer.config.max_tokens * self.decoder.downsample
+        return super().padded_frames(frames)
+
+    def _valid_tokens(self, lengths: Sequence[int]) -> Bool[Tensor, "B L"]:
+        tokens = torch.tensor([self.padded_frames(length) // self.decoder.downsample for length in lengths])
+        return frame_mask(tokens, int(tokens.max()))
+
+    def _predicted(
+        self,
+        text: Tensor,
+        valid: Tensor,
+        targets: Tensor,
+        mask: Tensor,
+        seeds: Sequence[int],
+        preset: TLControlPreset,
+    ) -> Float[Tensor, "B L C"]:
+        trajectories, given = self.transformer.trajectories(targets, mask)
+        logits = self.transformer(trajectories, given, text, valid)
+        if preset.guidance_scale != 1:
+            without = self.transformer(trajectories, given, torch.zeros_like(text), valid)
+            logits = without + preset.guidance_scale * (logits - without)
+        varied = None if preset.vary is None else part_index(preset.vary)
+        ids = draw_part_codes(logits, seeds, temperature=preset.temperature, varied=varied)
+        return self.tokenizer.quantizer.lookup(ids.where(valid[..., None], -1))
+
+    def _foot_terms(
+        self, latents: Tensor, frames: Tensor, mask: Tensor, preset: TLControlPreset
+    ) -> list[JointTerm]:
+        weight = 2.0 if preset.loss == "half_square" else 1.0  # that form halves its terms
+        if preset.foot == "contact":
+            return [ContactTerm.of_motion(self.decoder, latents, frames, mask, weight=weight)]
+        if preset.foot == "published":
+            return [PublishedFootTerm(frames, self.skeleton, weight=weight)]
+        return []
+
+
+def _padded(dense: Tensor, frames: int) -> Tensor:
+    return nn.functional.pad(dense, (0, 0, 0, 0, 0, frames - dense.shape[1]))
