@@ -20,6 +20,7 @@ from controlmm.training.control_masks import MaskMode, sample_masks
 from controlmm.training.corruption import corrupt_tokens
 from controlmm.training.masked import token_cross_entropy
 from controlmm.training.recipe import Recipe
+from controlmm.training.samples import clips_with_control
 from controlmm.training.soft_tokens import Sampling, mixed_codes
 from controlmm.training.stage import Stage, StageInputs, best_weights, by_size, load_tokenizer
 from controlmm.training.tokens import TokenBatch, TokenSampler
@@ -149,4 +150,5 @@ STAGE = Stage(
     ("rvq", "masked"),
     network="control",
     options=ControlOptions(),
+    samples=clips_with_control,
 )

@@ -14,6 +14,7 @@ from controlmm.models.rvq_vae import RvqVae
 from controlmm.nn.trunk import drop_text
 from controlmm.training.corruption import corrupt_tokens
 from controlmm.training.recipe import Recipe
+from controlmm.training.samples import clips_from_text
 from controlmm.training.settings import TrainingSettings
 from controlmm.training.stage import Stage, StageInputs, by_size, load_tokenizer
 from controlmm.training.tokens import TokenBatch, TokenSampler
@@ -167,4 +168,5 @@ STAGE = Stage(
     ("rvq",),
     network="transformer",
     options=MaskedOptions(),
+    samples=clips_from_text,
 )

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 from jaxtyping import Float
 from torch import Tensor
@@ -36,11 +35,3 @@ class Sample:
     title: str
     recorded: Float[Tensor, "T J 3"]
     made: Float[Tensor, "T J 3"]
-
-
-@runtime_checkable
-class ShowsSamples(Protocol):
-    """A recipe whose network's work can be looked at."""
-
-    def samples(self) -> Sequence[Sample]:
-        """The same few validation clips at every call, as the network in evaluation mode makes them."""

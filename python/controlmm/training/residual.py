@@ -15,6 +15,7 @@ from controlmm.nn.trunk import drop_text
 from controlmm.training import masked
 from controlmm.training.masked import token_cross_entropy
 from controlmm.training.recipe import Recipe
+from controlmm.training.samples import clips_with_residual_layers
 from controlmm.training.stage import Stage, StageInputs, by_size
 from controlmm.training.tokens import TokenBatch, TokenSampler
 
@@ -79,4 +80,12 @@ def _build(config: ResidualTransformerConfig, inputs: StageInputs) -> Recipe:
     return ResidualRecipe(config.for_text(inputs.text_encoder.dim), *inputs.token_samplers())
 
 
-STAGE = Stage("residual", _build, by_size(ResidualTransformerConfig), SETTINGS, ("rvq",), network="residual")
+STAGE = Stage(
+    "residual",
+    _build,
+    by_size(ResidualTransformerConfig),
+    SETTINGS,
+    ("rvq",),
+    network="residual",
+    samples=clips_with_residual_layers,
+)

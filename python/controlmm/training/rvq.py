@@ -18,6 +18,7 @@ from controlmm.motion.layout import feature_layout
 from controlmm.motion.normalizer import ROOT_CONTACT_BIAS, Normalizer
 from controlmm.ops import recover_joints
 from controlmm.training.recipe import Recipe
+from controlmm.training.samples import rebuilt_clips
 from controlmm.training.settings import TrainingSettings
 from controlmm.training.stage import Stage, StageInputs, by_size, fit_normalizer
 from controlmm.training.windows import WindowSampler
@@ -173,4 +174,5 @@ STAGE = Stage(
     uses_text=False,
     options=RvqOptions(),
     starts_from_weights=False,
+    samples=rebuilt_clips,
 )

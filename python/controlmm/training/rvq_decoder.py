@@ -23,6 +23,7 @@ from controlmm.motion.normalizer import Normalizer
 from controlmm.ops import recover_joints
 from controlmm.training.recipe import Recipe
 from controlmm.training.rvq import POSITION_WEIGHT, reconstruction_errors
+from controlmm.training.samples import rebuilt_clips
 from controlmm.training.settings import TrainingSettings
 from controlmm.training.stage import NORMALIZER_FILE, Stage, StageInputs, best_weights, by_size
 from controlmm.training.tokens import near_lengths, tokenize
@@ -31,7 +32,13 @@ from controlmm.training.windows import source_weights
 SETTINGS = {
     "paper": TrainingSettings(steps=20_000, batch_size=64, learning_rate=1e-4, warmup=200, bf16=False),
     "small": TrainingSettings(
-        steps=3000, batch_size=32, learning_rate=3e-4, warmup=50, validate_every=250, checkpoint_every=125
+        steps=2500,
+        batch_size=32,
+        learning_rate=8e-5,  # 3e-4 tears the trained decoder apart before it mends it
+        warmup=50,
+        average_decay=0.995,
+        validate_every=250,
+        checkpoint_every=125,
     ),
     "tiny": TrainingSettings(
         steps=20,
@@ -134,4 +141,5 @@ STAGE = Stage(
     ("rvq",),
     network="tokenizer",
     uses_text=False,
+    samples=rebuilt_clips,
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +18,7 @@ from controlmm.models.rvq_vae import RvqVae
 from controlmm.models.tokenizer import MotionTokenizer
 from controlmm.motion.normalizer import ROOT_CONTACT_BIAS, Normalizer
 from controlmm.text import TextEncoder, encode_all
-from controlmm.training.recipe import Recipe
+from controlmm.training.recipe import Recipe, Sample
 from controlmm.training.settings import TrainingSettings
 from controlmm.training.tokens import MIN_FRAMES, TokenSampler
 
@@ -91,6 +91,7 @@ class Stage:
     network: str | None = field(default=None, kw_only=True)  # its folder in the folder of a whole model
     uses_text: bool = field(default=True, kw_only=True)
     options: Any = field(default=None, kw_only=True)  # a frozen dataclass: the recipe's own, with defaults
+    samples: Callable[[Recipe, StageInputs], Sequence[Sample]] | None = field(default=None, kw_only=True)
     starts_from_weights: bool = field(default=True, kw_only=True)  # whether a model's weights are enough
 
 

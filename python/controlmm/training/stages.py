@@ -16,7 +16,7 @@ from controlmm.training.changes import with_changes
 from controlmm.training.loop import train
 from controlmm.training.processes import Processes
 from controlmm.training.provenance import clip_table, data_identity, file_hash
-from controlmm.training.recipe import Recipe, Sample, ShowsSamples
+from controlmm.training.recipe import Recipe, Sample
 from controlmm.training.registry import load_stage
 from controlmm.training.stage import Stage, StageInputs, best_weights
 from controlmm.training.starting import adopt_earlier_stages, load_starting_weights, starting_folder
@@ -99,8 +99,8 @@ def train_stage(
 
     def observe(step: int) -> None:
         if on_validation is not None:
-            samples = recipe.samples if isinstance(recipe, ShowsSamples) else list
-            on_validation(Validation(root / name, step, samples))
+            show = stage.samples
+            on_validation(Validation(root / name, step, lambda: show(recipe, inputs) if show else ()))
 
     train(
         _Described(recipe, about),

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 
 import torch
+from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from controlmm.nn.quantizer import EmaCodebook
 from controlmm.training.processes import Processes
@@ -47,7 +50,7 @@ class StepTaker:
                 break
             torch.manual_seed(self._settings.seed - attempt)
             self._recipe.model.train()
-            with torch.no_grad(), self._autocast():
+            with torch.no_grad(), self._computing():
                 self._recipe.loss(self._settings.batch_size)
         for book in self._codebooks:
             book.forget_pending()
@@ -79,7 +82,7 @@ class StepTaker:
         model.train()
         for shard in self._shards:
             torch.manual_seed(self._settings.seed * 1_000_003 + step + shard * _SHARD_STRIDE)
-            with self._autocast():
+            with self._computing():
                 losses = self._recipe.loss(self._settings.batch_size)
             (losses["loss"] / count).backward()
             for name, value in losses.items():
@@ -100,5 +103,13 @@ class StepTaker:
             self._team.sum_([pending.count, pending.total, pending.batches])
             book.apply_update(pending)
 
-    def _autocast(self) -> torch.autocast:
-        return torch.autocast(self._device_type, dtype=torch.bfloat16, enabled=self._settings.bf16)
+    @contextmanager
+    def _computing(self) -> Iterator[None]:
+        """Mixed precision; on a CPU plain attention, quicker than the tiled one for short sequences."""
+        with ExitStack() as contexts:
+            contexts.enter_context(
+                torch.autocast(self._device_type, dtype=torch.bfloat16, enabled=self._settings.bf16)
+            )
+            if self._device_type == "cpu":
+                contexts.enter_context(sdpa_kernel(SDPBackend.MATH))
+            yield

@@ -17,6 +17,7 @@ from controlmm.ops import recover_joints
 from controlmm.training import rvq
 from controlmm.training.recipe import Recipe
 from controlmm.training.rvq import reconstruction_errors
+from controlmm.training.samples import rebuilt_clips
 from controlmm.training.settings import TrainingSettings
 from controlmm.training.stage import Stage, StageInputs, by_size, fit_normalizer
 from controlmm.training.windows import PaddedClipSampler, WindowSampler
@@ -120,4 +121,5 @@ STAGE = Stage(
     network="tokenizer",
     uses_text=False,
     starts_from_weights=False,
+    samples=rebuilt_clips,
 )
