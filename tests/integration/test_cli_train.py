@@ -156,10 +156,12 @@ def test_other_settings_do_not_resume_a_run(root: Path, data: Path, refused: Com
 def test_options_of_a_stage_are_set_by_name(root: Path, data: Path, command: Command, tmp_path: Path) -> None:
     shutil.copytree(root, tmp_path / "root", ignore=shutil.ignore_patterns("control"))
     arguments = ("--data", data, "--config", "tiny", "--text", "hashing", "--out", tmp_path / "root")
-    options = ("--set", "masks=cross", "--set", "sampling=gumbel_st", "--set", "into_frozen_trunk=false")
+    named = ("masks=cross", "sampling=gumbel_st", "into_frozen_trunk=false", "milestones=1,2")
+    options = [part for name in named for part in ("--set", name)]
     command("train", "control", *arguments, *options, "--steps", 2, "--batch-size", 2, "--quiet")
     told = json.loads((tmp_path / "root" / "control" / "run.json").read_text())
-    assert told["options"] == {"masks": "cross", "sampling": "gumbel_st", "into_frozen_trunk": "false"}
+    assert told["options"] == dict(name.split("=") for name in named)
+    assert told["settings"]["milestones"] == [1, 2]
     assert told["alpha"] == 0.5  # the published one for such masks
     config = json.loads((tmp_path / "root" / "control" / "best" / "config.json").read_text())
     assert config["into_frozen_trunk"] is False

@@ -47,7 +47,7 @@ def train(
         typer.Option(
             "--set",
             metavar="NAME=VALUE",
-            help="Change an option of the stage or its network, such as masks=cross; may be repeated.",
+            help="Change an option of the stage, its network or its settings: masks=cross; may be repeated.",
         ),
     ] = None,
     shards: Annotated[

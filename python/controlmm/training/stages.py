@@ -57,8 +57,8 @@ def train_stage(
         root: Folder of all stages of one model.
         text_encoder: Needed by stages that use text; its features are cached beside the data.
         changes: Fields of :class:`TrainingSettings` to override.
-        options: Fields of the network's configuration or of the stage's own options to change, written as on
-            the command line: ``{"masks": "cross"}``.
+        options: Fields to change of the network's configuration, of the stage's own options or of its
+            settings, written as on the command line: ``{"masks": "cross"}``.
         start_from: Train given weights further: a network's folder, or the folder of a whole model, which
             also lends the earlier stages that ``root`` lacks (they are copied there). The network keeps its
             configuration; ``size`` then only names the settings.
@@ -80,7 +80,8 @@ def train_stage(
     if start_from is not None:
         start = starting_folder(Path(start_from), stage)
         config = read_config(start / CONFIG_FILE, type(config))
-    parts = with_changes({"config": config, "options": stage.options}, options or {})
+    parts = with_changes({"config": config, "options": stage.options, "settings": settings}, options or {})
+    settings = parts["settings"]
     inputs = StageInputs(
         root,
         MotionFolder(data),
