@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import pickle
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ _ALLOWED = {
     ("numpy", "ndarray"),
     ("numpy", "dtype"),
     ("_codecs", "encode"),  # how protocol 2 writes bytes
+    *((module, "_frombuffer") for module in ("numpy.core.numeric", "numpy._core.numeric")),  # protocol 5
 }
 
 
@@ -57,7 +59,8 @@ def _plain(content: bytes) -> Any:
 
 
 def _tensor(content: bytes) -> Any:
-    return torch.load(io.BytesIO(content), weights_only=True)
+    with warnings.catch_warnings(action="ignore"):  # it warns of pickles that are not its own
+        return torch.load(io.BytesIO(content), weights_only=True)
 
 
 def _pickled(content: bytes) -> Any:

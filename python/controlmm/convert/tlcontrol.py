@@ -77,6 +77,7 @@ def convert(paths: Sequence[Path], out: Path) -> ConversionReport:
         normalizer.save(folder / files.NORMALIZER_FILE)
         files.write_json(folder / files.TEXT_ENCODER_FILE, {"kind": "clip", "dim": CLIP_DIM})
         files.write_json(folder / files.PIPELINE_FILE, {"kind": TLControl.kind, "format": files.FORMAT})
+        (folder / "README.md").write_text(report.card(), encoding="utf-8")
     return report
 
 
