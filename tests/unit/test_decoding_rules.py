@@ -74,9 +74,9 @@ class Linear:
 # --- row 1: iterations ---
 
 
-def test_the_accurate_preset_has_the_codes_iterations_and_the_papers_other_reading_is_reachable():
-    assert PRESETS["accurate"].budget.logits_iterations == 100
-    assert PRESETS["accurate"].budget.latent_iterations == 600
+def test_the_papers_accurate_preset_has_the_codes_iterations_and_the_papers_other_reading_is_reachable():
+    assert PRESETS["paper-accurate"].budget.logits_iterations == 100
+    assert PRESETS["paper-accurate"].budget.latent_iterations == 600
     other = Preset(EditingBudget(logits_iterations=600, latent_iterations=100))
     assert (other.budget.logits_iterations_in(0), other.budget.latent_iterations) == (600, 100)
 

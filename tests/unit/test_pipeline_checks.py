@@ -109,7 +109,7 @@ def test_impossible_presets_are_refused(changes, message):
 
 def test_presets_have_the_papers_iteration_counts():
     """100 logits iterations in each of ten steps and 600 codebook iterations at the end (appendix A.3)."""
-    accurate = PRESETS["accurate"]
+    accurate = PRESETS["paper-accurate"]
     assert (accurate.budget.logits_iterations, accurate.budget.latent_iterations, accurate.steps) == (
         100,
         600,

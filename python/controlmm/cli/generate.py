@@ -40,7 +40,9 @@ def generate(
         Path | None,
         typer.Option(help="JSON file with obstacles to keep clear of, beside those in the control file."),
     ] = None,
-    preset: Annotated[str, typer.Option(help="fast, balanced or accurate.")] = "balanced",
+    preset: Annotated[
+        str, typer.Option(help="fast, balanced or accurate; with paper- in front as in the papers.")
+    ] = "balanced",
     samples: Annotated[int, typer.Option(help="Number of motions.")] = 1,
     vary: Annotated[
         str | None,

@@ -5,9 +5,10 @@ Latents are edited at the end, by ``controlmm.generation.solvers``.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Float
@@ -19,12 +20,20 @@ from controlmm.generation.solvers.gradient import plain_gradient
 from controlmm.generation.token_mixture import token_mixture
 
 EditingOptimizer = Literal["adamw", "gradient"]
+LatentSolver = Literal["papers", "auto", "gauss-newton", "lbfgs"]
 _OPTIMIZERS = {"adamw": papers_optimizer, "gradient": plain_gradient}
 
 
 @dataclass(frozen=True)
 class EditingBudget:
-    """How many gradient steps editing may take."""
+    """How editing looks for latents, and how long.
+
+    Attributes:
+        solver: "papers" takes the optimiser and the rates below; "gauss-newton", "lbfgs", or "auto", which
+            chooses between them, need no rates.
+        tolerance: Metres. A clip is done when it is this near its targets.
+        time_budget: Seconds for the latents of a batch. Results then depend on the speed of the machine.
+    """
 
     logits_iterations: int = 0  # in each decoding step
     logits_iterations_grow: bool = False  # step k takes k times as many: the published command's default, 35
@@ -34,6 +43,10 @@ class EditingBudget:
     decays_rate: bool = True  # cosine decay of the latents' rate to zero; the papers keep it constant
     optimizer: EditingOptimizer = "adamw"  # published code; "gradient": plain steps, as the paper writes it
 
+    solver: LatentSolver = "papers"  # of latents
+    tolerance: float | None = None
+    time_budget: float | None = None
+
     def __post_init__(self) -> None:
         if self.logits_iterations < 0 or self.latent_iterations < 0:
             raise ValueError(f"Iterations must not be negative, got {self}.")
@@ -42,6 +55,13 @@ class EditingBudget:
                 raise ValueError(f"`{name}` must be positive, got {getattr(self, name)}.")
         if self.optimizer not in _OPTIMIZERS:
             raise ValueError(f"`optimizer` must be one of {tuple(_OPTIMIZERS)}, got {self.optimizer!r}.")
+
+        if self.solver not in get_args(LatentSolver):
+            raise ValueError(f"`solver` must be one of {get_args(LatentSolver)}, got {self.solver!r}.")
+        for name in ("tolerance", "time_budget"):
+            value = getattr(self, name)
+            if value is not None and not (math.isfinite(value) and value > 0):
+                raise ValueError(f"`{name}` must be a positive number or None, got {value!r}.")
 
     def logits_iterations_in(self, step: int) -> int:
         """Gradient steps on the logits in decoding step ``step``, counted from 0."""

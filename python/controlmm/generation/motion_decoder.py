@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from controlmm.generation.frozen_decoder import FrozenDecoder
+from controlmm.generation.sensitivity import WINDOW, Sensitivity, measure_sensitivity
 from controlmm.models.tokenizer import MotionTokenizer
 from controlmm.motion.normalizer import Normalizer
 from controlmm.ops import recover_joints
+
+_SEQUENCES, _SEED = 6, 1  # of random codes
+_REMEMBERED = 4  # matrices of channel products; each may take 100 MB
 
 
 class MotionDecoder(nn.Module):
@@ -21,6 +27,46 @@ class MotionDecoder(nn.Module):
         super().__init__()
         self.tokenizer = tokenizer.eval().requires_grad_(False)
         self.normalizer = normalizer
+        self._packed_version: tuple[int, ...] = ()
+        self._frozen: dict[torch.dtype, FrozenDecoder] = {}
+        self._sensitivities: dict[tuple[int, ...], Sensitivity] = {}
+        self._grams: dict[tuple[tuple[int, ...], int], Tensor] = {}
+
+    def frozen(self, dtype: torch.dtype = torch.float32) -> FrozenDecoder:
+        """The decoder's convolutions packed for editing; packed again when its weights have changed."""
+        weights = self.tokenizer.decoder
+        version = tuple(x for p in weights.parameters() for x in (p.data_ptr(), p._version))
+        if self._packed_version != version:
+            self._packed_version = version
+            self._frozen.clear()
+            self._sensitivities.clear()
+            self._grams.clear()
+        if dtype not in self._frozen:
+            self._frozen[dtype] = FrozenDecoder(weights, dtype=dtype)
+        return self._frozen[dtype]
+
+    def channel_gram(self, channels: tuple[int, ...], tokens: int) -> Float[Tensor, "D T D T"]:
+        """Products of the rows of the decoder's Jacobian, on average over random codes; see ``sensitivity``.
+
+        Made at the first call for some channels (a fraction of a second), remembered for a few lengths.
+        """
+        frozen = self.frozen()
+        if channels not in self._sensitivities:
+            self._sensitivities[channels] = measure_sensitivity(
+                frozen, self.typical_latents(), channels, downsample=self.downsample
+            )
+        if (channels, tokens) not in self._grams:
+            while len(self._grams) >= _REMEMBERED:
+                self._grams.pop(next(iter(self._grams)))
+            self._grams[channels, tokens] = self._sensitivities[channels].gram(tokens)
+        return self._grams[channels, tokens]
+
+    def typical_latents(self) -> Float[Tensor, "S W C"]:
+        """A few sequences of random codes, always the same."""
+        generator = torch.Generator().manual_seed(_SEED)
+        sizes = (_SEQUENCES, WINDOW, self.tokenizer.config.num_quantizers)
+        ids = torch.randint(len(self.tokenizer.base_codes), sizes, generator=generator)
+        return self.tokenizer.quantizer.lookup(ids)
 
     @property
     def downsample(self) -> int:

@@ -9,8 +9,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from controlmm.generation.control_residuals import ControlResiduals
 from controlmm.generation.motion_decoder import MotionDecoder
+from controlmm.generation.partial_decoder import PartialDecoder, controlled_joints
 from controlmm.generation.terms import JointTerm
+from controlmm.models.rvq_vae import RvqVae
 from controlmm.ops import frames_last, guidance_value_and_grad, masked_consistency_loss, recover_joints
 from controlmm.ops.consistency import Norm
 
@@ -57,10 +60,12 @@ class ControlObjective:
         norm: Norm = "mse",
         terms: Sequence[JointTerm] = (),
     ) -> None:
-        self.decoder, self.norm = decoder, norm
-        self.targets, self.mask = frames_last(targets), frames_last(mask)
-        self.frames = None if frames.all() else frames
+        self.targets, self.mask = targets, mask
+        self.decoder, self.frames, self.norm = decoder, frames, norm
         self.terms = tuple(terms)
+        self._part = PartialDecoder(decoder, self._joints(), frames)
+        joints = list(self._part.joints)
+        self._wanted = frames_last(targets[:, :, joints]), frames_last(mask[:, :, joints])
         self._loss = torch.zeros(len(targets))
         self._gradient: Tensor | None = None  # of the decoder's output, written again at every evaluation
 
@@ -68,38 +73,38 @@ class ControlObjective:
         self, latents: Float[Tensor, "B L C"]
     ) -> tuple[Float[Tensor, "B"], Float[Tensor, "B L C"]]:
         """See :class:`Objective`."""
-        statistics = self.decoder.normalizer
-        with torch.enable_grad():
-            latents = latents.detach().requires_grad_()
-            decoded = self.decoder.tokenizer.decode_channels(latents, self.frames)
-        loss, self._gradient = guidance_value_and_grad(
-            decoded.detach(),
-            self.targets,
-            self.mask,
-            mean=statistics.mean,
-            std=statistics.std,
+        part = self._part
+        decoded = part.decode(latents.detach())
+        self._loss, self._gradient = guidance_value_and_grad(
+            decoded.features.mT,
+            *self._wanted,
+            mean=part.mean,
+            std=part.std,
             norm=self.norm,
             out=self._gradient,
         )
         if self.terms:
-            values, slope = self._terms_and_gradient(decoded.detach())
-            loss = loss + values
-            self._gradient += slope
-        (gradient,) = torch.autograd.grad(decoded, latents, self._gradient)
-        self._loss = loss
-        return loss, gradient
+            values, slope = self._terms_and_gradient(decoded.features)
+            self._loss = self._loss + values
+            self._gradient += slope.mT
+        return self._loss, part.pull(decoded, self._gradient.mT)
 
     def select(self, clips: Int[Tensor, "S"]) -> ControlObjective:
         """See :class:`Objective`."""
-        frames = torch.ones(self.mask.shape[:2], dtype=torch.bool) if self.frames is None else self.frames
         return ControlObjective(
             self.decoder,
             self.targets[clips],
             self.mask[clips],
-            frames[clips],
+            self.frames[clips],
             norm=self.norm,
             terms=[term.select(clips) for term in self.terms],
         )
+
+    def residuals(self) -> ControlResiduals | None:
+        """The same as a sum of squares, for Gauss-Newton; ``None`` if it is none that Gauss-Newton knows."""
+        if self.terms or self.norm != "mse" or not isinstance(self.decoder.tokenizer, RvqVae):
+            return None
+        return ControlResiduals(self.decoder, self.targets, self.mask, self.frames)
 
     def errors(self) -> Float[Tensor, "B"]:
         """At least the mean distance of the controlled points in metres, at the latest evaluation.
@@ -112,14 +117,16 @@ class ControlObjective:
             return self._loss
         return (3 * self._loss).sqrt() if self.norm == "mse" else 3 * self._loss
 
+    def _joints(self) -> tuple[int, ...]:
+        """Terms see all joints, distances to targets only those that have some."""
+        return tuple(range(self.targets.shape[2])) if self.terms else controlled_joints(self.mask)
+
     @torch.enable_grad()
     def _terms_and_gradient(
-        self, decoded: Float[Tensor, "B D T"]
-    ) -> tuple[Float[Tensor, "B"], Float[Tensor, "B D T"]]:
-        statistics = self.decoder.normalizer
-        decoded.requires_grad_()
-        features = statistics.denormalize(decoded.transpose(1, 2))
-        joints = recover_joints(features, joints=statistics.skeleton.num_joints)
+        self, decoded: Float[Tensor, "B T D"]
+    ) -> tuple[Float[Tensor, "B"], Float[Tensor, "B T D"]]:
+        decoded = decoded.requires_grad_()
+        joints = recover_joints(decoded * self._part.std + self._part.mean, joints=len(self._part.joints))
         values = torch.stack([term.values(joints) for term in self.terms]).sum(0)
         (slope,) = torch.autograd.grad(values.sum(), decoded)
         return values.detach(), slope

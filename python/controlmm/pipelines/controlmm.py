@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from controlmm.generation.latent_editing import edit_latents
 from controlmm.generation.masked_decoding import (
     DecodingRequest,
     decode_from_text,
@@ -23,7 +24,7 @@ from controlmm.generation.masked_decoding import (
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.noise import ClipNoise
 from controlmm.generation.objective import ControlObjective
-from controlmm.generation.solvers import Progress, Stopping, adamw, gradient_descent
+from controlmm.generation.solvers import Progress
 from controlmm.generation.terms import JointTerm
 from controlmm.models.control_branch import ControlBranch
 from controlmm.models.length_estimator import LengthEstimator
@@ -204,7 +205,7 @@ class ControlMM(MotionPipeline[Preset]):
             latents = self._from_text(request, preset)
         else:
             latents = self._from_logits(request, objective, branch, preset)
-        return self._edit(latents, objective, keep, preset, request.progress)
+        return edit_latents(objective, latents, keep, preset.budget, progress=request.progress).latents
 
     def _from_logits(
         self,
@@ -226,24 +227,6 @@ class ControlMM(MotionPipeline[Preset]):
             self.residual, base_ids, request, guidance_scale=preset.residual_guidance_scale
         )
         return final_latents(self.decoder.tokenizer, logits, ids, request)
-
-    def _edit(
-        self,
-        latents: Float[Tensor, "B L C"],
-        objective: ControlObjective,
-        keep: Float[Tensor, "B L 1"],
-        preset: Preset,
-        progress: Progress | None,
-    ) -> Float[Tensor, "B L C"]:
-        budget = preset.budget
-        stopping = Stopping(iterations=budget.latent_iterations)
-        rate = budget.latent_rate * self.decoder.tokenizer.base_codes.std().item()
-        if budget.optimizer == "gradient":
-            return gradient_descent(objective, latents, keep, stopping, rate=rate, progress=progress).latents
-        decays = budget.decays_rate
-        return adamw(
-            objective, latents, keep, stopping, rate=rate, decays_rate=decays, progress=progress
-        ).latents
 
 
 def _padded(dense: Tensor, frames: int) -> Tensor:

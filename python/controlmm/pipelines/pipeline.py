@@ -108,7 +108,8 @@ class MotionPipeline(ABC, Generic[_Plan]):
                 one in :class:`Avoid` to choose joints and margin.
             objectives: Differentiable functions of the joints to be made small.
             samples: How many motions; sample ``i`` is the same however many are asked for.
-            preset: ``fast``, ``balanced``, ``accurate`` (the papers' settings), or a preset of one's own.
+            preset: ``fast``, ``balanced``, ``accurate``, one of the papers' (``paper-accurate``), or a preset
+                of one's own.
             guidance_scale: How strongly the text counts; ``None`` takes the preset's.
             seed: Same seed, same motions.
             progress: Called as ``progress(phase, done, total)`` during long loops.

@@ -2,6 +2,7 @@
 
 from controlmm.generation.solvers.adamw import adamw
 from controlmm.generation.solvers.clip_search import Progress
+from controlmm.generation.solvers.gauss_newton import gauss_newton
 from controlmm.generation.solvers.gradient import gradient_descent
 from controlmm.generation.solvers.lbfgs import LbfgsTolerance, lbfgs
 from controlmm.generation.solvers.stopping import Reason, Solution, Stopping
@@ -13,6 +14,7 @@ __all__ = [
     "Solution",
     "Stopping",
     "adamw",
+    "gauss_newton",
     "gradient_descent",
     "lbfgs",
 ]

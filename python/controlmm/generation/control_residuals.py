@@ -1,0 +1,112 @@
+"""The control loss as a sum of squares: what Gauss-Newton sees of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from controlmm.generation.kinematic_rows import KinematicRows, kinematic_rows
+from controlmm.generation.motion_decoder import MotionDecoder
+from controlmm.generation.partial_decoder import PartialDecoder, controlled_joints
+from controlmm.ops import recover_joints
+
+
+@dataclass(frozen=True, eq=False)
+class Probe:
+    """One clip at one point.
+
+    Attributes:
+        residual: (N,) controlled coordinates minus their targets, metres, float64.
+        features: (T, D) de-normalised channels of the wanted joints, on the clip's own frames.
+        joints: (T, J, 3) what they decode to, metres.
+        mask: (T, J, 3) the controlled coordinates.
+        std: (D,) of the channels.
+    """
+
+    residual: Float[Tensor, "N"]
+    features: Float[Tensor, "T D"]
+    joints: Float[Tensor, "T J 3"]
+    mask: Bool[Tensor, "T J 3"]
+    std: Float[Tensor, "D"]
+
+    @property
+    def loss(self) -> float:
+        """Mean squared error, as of :class:`ControlObjective`."""
+        return self.residual.square().mean().item() if len(self.residual) else 0.0
+
+    def rows(self) -> KinematicRows:
+        """How the residual answers to the channels, here."""
+        return kinematic_rows(self.features, self.joints, self.mask, self.std)
+
+
+class ControlResiduals:
+    """Controlled coordinates of decoded latents minus their targets.
+
+    Args:
+        decoder: Latents to joints.
+        targets: (B, T, J, 3) metres.
+        mask: (B, T, J, 3), the controlled coordinates.
+        frames: (B, T), the frames of each clip.
+    """
+
+    def __init__(
+        self,
+        decoder: MotionDecoder,
+        targets: Float[Tensor, "B T J 3"],
+        mask: Bool[Tensor, "B T J 3"],
+        frames: Bool[Tensor, "B T"],
+        *,
+        joints: Sequence[int] | None = None,
+    ) -> None:
+        self.decoder, self._targets, self._mask, self._frames = decoder, targets, mask, frames
+        self.part = PartialDecoder(decoder, joints or controlled_joints(mask), frames)
+        wanted = list(self.part.joints)
+        self._wanted, self._controlled = targets[:, :, wanted], mask[:, :, wanted]
+        self._lengths: list[int] = frames.sum(1).tolist()
+
+    def select(self, clips: Int[Tensor, "S"]) -> ControlResiduals:
+        """The same for some of the clips."""
+        return ControlResiduals(
+            self.decoder,
+            self._targets[clips],
+            self._mask[clips],
+            self._frames[clips],
+            joints=self.part.joints,
+        )
+
+    @torch.enable_grad()
+    def probe(self, latents: Float[Tensor, "B L C"]) -> list[Probe]:
+        """Residuals of all clips; the pass is kept for :meth:`pull`."""
+        part = self.part
+        self._decoded = part.decode(latents.detach())
+        self._features = self._decoded.features.requires_grad_()
+        features = self._features * part.std + part.mean
+        self._joints = recover_joints(features, joints=len(part.joints))
+        joints, difference = self._joints.detach(), self._joints.detach() - self._wanted
+        return [
+            Probe(
+                difference[clip][mask].double(),
+                features[clip, :length].detach(),
+                joints[clip, :length],
+                mask[:length],
+                part.std,
+            )
+            for clip, (mask, length) in enumerate(zip(self._controlled, self._lengths, strict=True))
+        ]
+
+    def channel_gram(self, frames: int) -> Float[Tensor, "D T D T"]:
+        """Products of the decoder's rows for clips of ``frames`` frames, on average."""
+        return self.decoder.channel_gram(self.part.channels, frames // self.decoder.downsample)
+
+    def pull(self, weights: Sequence[Float[Tensor, "N"] | None]) -> Float[Tensor, "B L C"]:
+        """Gradients of ``weights . residual`` at the latest probe; zero for clips without weights."""
+        gradient = torch.zeros_like(self._joints)
+        for clip, wanted in enumerate(weights):
+            if wanted is not None:
+                gradient[clip][self._controlled[clip]] = wanted.float()
+        (features,) = torch.autograd.grad(self._joints, self._features, gradient, retain_graph=True)
+        return self.part.pull(self._decoded, features)

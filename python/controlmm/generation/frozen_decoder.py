@@ -1,0 +1,120 @@
+"""The tokenizer's decoder for editing: values, and products with its Jacobian from both sides.
+
+It is piecewise linear, so that one pass that remembers which units were on gives both products without an
+autograd graph. Only the channels that an objective looks at are computed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from controlmm.generation.frozen_layers import FrozenConv
+from controlmm.nn.conv import ConvDecoder, ResidualConvBlock, ResidualStack
+
+
+@dataclass(frozen=True, eq=False)
+class Tape:
+    """What a pass through the decoder leaves for its Jacobian: inputs of rectifiers, in their order."""
+
+    channels: tuple[int, ...]
+    entry: Float[Tensor, "B L C"]
+    blocks: tuple[tuple[Float[Tensor, "B T C"], Float[Tensor, "B T C"]], ...]
+    smooth: Float[Tensor, "B T C"]
+
+    def select(self, clips: Tensor) -> Tape:
+        """The tape of some of the clips; a clip may be named many times."""
+        blocks = tuple((inner[clips], hidden[clips]) for inner, hidden in self.blocks)
+        return Tape(self.channels, self.entry[clips], blocks, self.smooth[clips])
+
+
+class _Block:
+    def __init__(self, block: ResidualConvBlock, dtype: torch.dtype) -> None:
+        self.dilated = FrozenConv.of(block.dilated, dtype)
+        self.pointwise = FrozenConv.of(block.pointwise, dtype)
+
+
+class FrozenDecoder:
+    """A frozen copy of a :class:`ConvDecoder`; clips of one batch have the same number of tokens.
+
+    Args:
+        decoder: Where the weights come from. Later changes of it are not seen.
+        dtype: Of the arithmetic. bfloat16 is for processors with AMX and for steps that need no exact value.
+    """
+
+    def __init__(self, decoder: ConvDecoder, *, dtype: torch.dtype = torch.float32) -> None:
+        self._dtype = dtype
+        self._entry = FrozenConv.of(decoder.entry, dtype)
+        self._stacks = [
+            [_Block(cast(ResidualConvBlock, block), dtype) for block in cast(ResidualStack, stack)]
+            for stack in decoder.stacks
+        ]
+        self._ups = [FrozenConv.of(cast(nn.Conv1d, up), dtype) for up in decoder.up]
+        self._smooth = FrozenConv.of(decoder.smooth, dtype)
+        self._exit = decoder.exit
+        self._exits: dict[tuple[int, ...], FrozenConv] = {}
+
+    def forward(
+        self, latents: Float[Tensor, "B L C"], channels: Sequence[int]
+    ) -> tuple[Float[Tensor, "B T D"], Tape]:
+        """Normalised features, only ``channels`` of them, and what the Jacobian products need."""
+        x = entry = self._entry.forward(latents.to(self._dtype), is_rectified=True)
+        saved = []
+        for stack, up in zip(self._stacks, self._ups, strict=True):
+            for block in stack:
+                hidden = block.dilated.forward(x.clamp_min(0), is_rectified=True)
+                saved.append((x, hidden))
+                x = x + block.pointwise.forward(hidden)
+            x = up.forward(_doubled(x))
+        smooth = self._smooth.forward(x, is_rectified=True)
+        tape = Tape(tuple(channels), entry, tuple(saved), smooth)
+        return self._exit_for(tape.channels).forward(smooth).to(latents.dtype), tape
+
+    def pull(self, tape: Tape, gradient: Float[Tensor, "B T D"]) -> Float[Tensor, "B L C"]:
+        """Gradient in the latents, given that in the features: the transposed Jacobian times a vector."""
+        dtype = gradient.dtype
+        gradient = self._exit_for(tape.channels).backward(gradient.to(self._dtype))
+        gradient = self._smooth.backward(_switched(gradient, tape.smooth))
+        saved = list(tape.blocks)
+        for stack, up in zip(reversed(self._stacks), reversed(self._ups), strict=True):
+            gradient = up.backward(gradient).unflatten(1, (-1, 2)).sum(2)
+            for block in reversed(stack):
+                x, hidden = saved.pop()
+                inner = block.dilated.backward(_switched(block.pointwise.backward(gradient), hidden))
+                gradient = gradient + _switched(inner, x)
+        return self._entry.backward(_switched(gradient, tape.entry)).to(dtype)
+
+    def push(self, tape: Tape, tangent: Float[Tensor, "B L C"]) -> Float[Tensor, "B T D"]:
+        """Change of the features for a small change of the latents: the Jacobian times a vector."""
+        x = _switched(self._entry.forward(tangent.to(self._dtype), is_tangent=True), tape.entry)
+        saved = iter(tape.blocks)
+        for stack, up in zip(self._stacks, self._ups, strict=True):
+            for block in stack:
+                before, hidden = next(saved)
+                inner = _switched(block.dilated.forward(_switched(x, before), is_tangent=True), hidden)
+                x = x + block.pointwise.forward(inner, is_tangent=True)
+            x = up.forward(_doubled(x), is_tangent=True)
+        x = _switched(self._smooth.forward(x, is_tangent=True), tape.smooth)
+        return self._exit_for(tape.channels).forward(x, is_tangent=True).to(tangent.dtype)
+
+    def _exit_for(self, channels: tuple[int, ...]) -> FrozenConv:
+        if channels not in self._exits:
+            wanted, bias = list(channels), self._exit.bias
+            assert bias is not None
+            self._exits[channels] = FrozenConv(self._exit.weight[wanted], bias[wanted], 1, self._dtype)
+        return self._exits[channels]
+
+
+def _doubled(x: Float[Tensor, "B T C"]) -> Float[Tensor, "B 2T C"]:
+    return x.repeat_interleave(2, dim=1)
+
+
+def _switched(gradient: Float[Tensor, "B T C"], x: Float[Tensor, "B T C"]) -> Float[Tensor, "B T C"]:
+    """``gradient`` where the rectifier of ``x`` was on."""
+    result: Tensor = torch.ops.aten.threshold_backward(gradient, x, 0)
+    return result

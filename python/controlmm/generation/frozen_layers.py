@@ -1,0 +1,105 @@
+"""Convolutions with frozen weights as matrix products, weights packed once: what editing spends its time in.
+
+An editing step needs no gradient of the weights, so a convolution is a product with one matrix on the way
+forward and with another on the way back, and both can be brought into the order that the processor likes
+before the first step. oneDNN's packed products also give a clip the same numbers, bit by bit, in any batch
+and with any number of threads.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+_TYPICAL_ROWS = 196  # the frames of one clip: what packing prepares for
+
+
+def has_fast_bfloat16() -> bool:
+    """Whether this processor multiplies bfloat16 matrices in tiles (AMX)."""
+    return (
+        bool(torch.cpu._is_amx_tile_supported())
+        and _packed(torch.zeros(16, 16, dtype=torch.bfloat16)) is not None
+    )
+
+
+class FrozenMatrix:
+    """``x -> x W^T + b`` with a packed ``W``."""
+
+    def __init__(
+        self, weight: Float[Tensor, "out in"], bias: Float[Tensor, "out"] | None, dtype: torch.dtype
+    ) -> None:
+        weight = weight.detach().to(dtype).contiguous()
+        self._bias = None if bias is None else bias.detach().to(dtype)
+        self._columns = weight.t().contiguous()
+        self._packed = _packed(weight)
+
+    def __call__(
+        self, x: Float[Tensor, "N in"], *, is_rectified: bool = False, is_tangent: bool = False
+    ) -> Tensor:
+        """The product; rectified, or without the bias."""
+        bias = None if is_tangent else self._bias
+        if self._packed is not None:
+            result: Tensor = torch.ops.mkldnn._linear_pointwise(
+                x, self._packed, bias, "relu" if is_rectified else "none", [], ""
+            )
+            return result
+        result = x @ self._columns if bias is None else torch.addmm(bias, x, self._columns)
+        return result.clamp_min_(0) if is_rectified else result
+
+
+def _packed(weight: Tensor) -> Tensor | None:
+    """``weight`` in oneDNN's order; ``None`` where this torch or processor cannot."""
+    if weight.dtype == torch.float64 or not torch.backends.mkldnn.is_available():
+        return None
+    try:
+        packed: Tensor = torch.ops.mkldnn._reorder_linear_weight(weight, _TYPICAL_ROWS)
+        torch.ops.mkldnn._linear_pointwise(weight.new_zeros(1, weight.shape[1]), packed, None, "none", [], "")
+    except (AttributeError, RuntimeError):  # the operators are private: other versions may lack them
+        return None
+    return packed
+
+
+class FrozenConv:
+    """A convolution of width 1 or 3 over time that keeps the number of frames; (B, T, C) tensors."""
+
+    def __init__(
+        self, weight: Float[Tensor, "out in k"], bias: Float[Tensor, "out"], dilation: int, dtype: torch.dtype
+    ) -> None:
+        weight = weight.detach()
+        self._dilation, self._taps = dilation, weight.shape[-1]
+        self._forward = FrozenMatrix(weight.permute(0, 2, 1).flatten(1), bias, dtype)
+        self._backward = FrozenMatrix(weight.flip(-1).permute(1, 2, 0).flatten(1), None, dtype)
+
+    @classmethod
+    def of(cls, conv: nn.Conv1d, dtype: torch.dtype) -> FrozenConv:
+        """A frozen copy of ``conv``."""
+        assert conv.bias is not None  # the decoder's convolutions all have one
+        return cls(conv.weight, conv.bias.detach(), conv.dilation[0], dtype)
+
+    def forward(
+        self, x: Float[Tensor, "B T C"], *, is_rectified: bool = False, is_tangent: bool = False
+    ) -> Float[Tensor, "B T D"]:
+        """The convolution, rectified if asked for; of a tangent: without the bias."""
+        product = self._forward(self._rows(x), is_rectified=is_rectified, is_tangent=is_tangent)
+        result: Tensor = product.unflatten(0, x.shape[:2])
+        return result
+
+    def backward(self, gradient: Float[Tensor, "B T D"]) -> Float[Tensor, "B T C"]:
+        """The gradient in the input, given that in the output."""
+        product: Tensor = self._backward(self._rows(gradient)).unflatten(0, gradient.shape[:2])
+        return product
+
+    def _rows(self, x: Float[Tensor, "B T C"]) -> Float[Tensor, "N taps"]:
+        return x.flatten(0, 1) if self._taps == 1 else neighbours(x, self._dilation).flatten(0, 1)
+
+
+def neighbours(x: Float[Tensor, "B T C"], distance: int) -> Float[Tensor, "B T 3C"]:
+    """Every frame between those ``distance`` before and after it, zeros beyond the ends."""
+    batch, frames, channels = x.shape
+    rows = x.new_zeros(batch, frames, 3 * channels)
+    rows[..., channels : 2 * channels] = x
+    if frames > distance:
+        rows[:, distance:, :channels] = x[:, :-distance]
+        rows[:, :-distance, 2 * channels :] = x[:, distance:]
+    return rows

@@ -1,0 +1,61 @@
+"""Editing of latents at the end of generation: which solver runs, and how long."""
+
+from __future__ import annotations
+
+from jaxtyping import Float
+from torch import Tensor
+
+from controlmm.generation.editing import EditingBudget
+from controlmm.generation.objective import ControlObjective
+from controlmm.generation.solvers import (
+    Progress,
+    Solution,
+    Stopping,
+    adamw,
+    gauss_newton,
+    gradient_descent,
+    lbfgs,
+)
+
+_PER_METRE = {"m": 1.0, "mm": 1000.0}  # of a skeleton's unit
+
+
+def edit_latents(
+    objective: ControlObjective,
+    latents: Float[Tensor, "B L C"],
+    keep: Float[Tensor, "B L 1"],
+    budget: EditingBudget,
+    *,
+    progress: Progress | None = None,
+) -> Solution:
+    """Latents that meet the objective as well as ``budget`` allows.
+
+    Args:
+        objective: Targets of the clips.
+        latents: Where to start.
+        keep: 1 where a token may change, 0 in padding and where it is held fixed.
+        budget: Solver and limits. ``auto`` takes Gauss-Newton for squared distances to targets and L-BFGS for
+            everything else.
+        progress: Called after every evaluation.
+    """
+    unit = _PER_METRE[objective.decoder.normalizer.skeleton.unit]
+    stopping = Stopping(
+        error=None if budget.tolerance is None else budget.tolerance * unit,
+        iterations=budget.latent_iterations,
+        milliseconds=None if budget.time_budget is None else 1000 * budget.time_budget,
+    )
+    if budget.solver == "papers":
+        rate = budget.latent_rate * objective.decoder.tokenizer.base_codes.std().item()
+        if budget.optimizer == "gradient":
+            return gradient_descent(objective, latents, keep, stopping, rate=rate, progress=progress)
+        decays = budget.decays_rate
+        return adamw(objective, latents, keep, stopping, rate=rate, decays_rate=decays, progress=progress)
+    residuals = objective.residuals()
+    if budget.solver == "gauss-newton" and residuals is None:
+        raise ValueError(
+            "`solver` 'gauss-newton' needs squared distances to targets of a residual tokenizer. Use 'lbfgs' "
+            "or 'auto'."
+        )
+    if budget.solver == "lbfgs" or residuals is None:
+        return lbfgs(objective, latents, keep, stopping, progress=progress)
+    return gauss_newton(residuals, latents, keep, stopping, progress=progress)

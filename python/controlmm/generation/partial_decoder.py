@@ -1,0 +1,86 @@
+"""The decoder as an objective sees it: some joints of clips of any lengths, padding left out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from controlmm.generation.frozen_decoder import FrozenDecoder, Tape
+from controlmm.generation.motion_decoder import MotionDecoder
+
+
+def controlled_joints(mask: Bool[Tensor, "B T J 3"]) -> tuple[int, ...]:
+    """The pelvis, which carries all others, and the joints that some clip controls."""
+    used = mask.any(-1).flatten(0, 1).any(0).nonzero()[:, 0].tolist()
+    return (0, *(joint for joint in used if joint != 0))
+
+
+@dataclass(frozen=True, eq=False)
+class Decoded:
+    """One pass: features (B, T, D') of the wanted joints, normalised, zero in padding; and the way back."""
+
+    features: Float[Tensor, "B T D"]
+    tapes: tuple[Tape, ...]
+
+
+class PartialDecoder:
+    """Decodes the channels of some joints: 4 of the root and 3 for every other one.
+
+    Every clip is decoded at its own length, without padding, so that its numbers do not depend on the clips
+    beside it.
+
+    Args:
+        decoder: The whole decoder.
+        joints: Which joints, the pelvis (0) first.
+        frames: (B, T), the frames of each clip.
+        dtype: Of the decoder's arithmetic.
+    """
+
+    def __init__(
+        self,
+        decoder: MotionDecoder,
+        joints: Sequence[int],
+        frames: Bool[Tensor, "B T"],
+        *,
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        self.decoder, self.joints, self.frames, self._dtype = decoder, tuple(joints), frames, dtype
+        self.channels = (0, 1, 2, 3, *(1 + 3 * j + axis for j in self.joints[1:] for axis in range(3)))
+        channels = list(self.channels)
+        self.mean, self.std = decoder.normalizer.mean[channels], decoder.normalizer.std[channels]
+        self._frozen: FrozenDecoder = decoder.frozen(dtype)
+        tokens = frames[:, :: decoder.downsample].sum(1)
+        self.groups: list[tuple[int, Int[Tensor, "N"]]] = [
+            (length, (tokens == length).nonzero()[:, 0]) for length in tokens.unique().tolist()
+        ]
+
+    def select(self, clips: Int[Tensor, "S"]) -> PartialDecoder:
+        """The same for some of the clips."""
+        return PartialDecoder(self.decoder, self.joints, self.frames[clips], dtype=self._dtype)
+
+    def decode(self, latents: Float[Tensor, "B L C"]) -> Decoded:
+        """Features of the wanted joints."""
+        step = self.decoder.downsample
+        features = latents.new_zeros(len(latents), latents.shape[1] * step, len(self.channels))
+        tapes = []
+        for length, rows in self.groups:
+            decoded, tape = self._frozen.forward(latents[rows, :length], self.channels)
+            features[rows, : length * step] = decoded
+            tapes.append(tape)
+        return Decoded(features, tuple(tapes))
+
+    def pull(self, decoded: Decoded, gradient: Float[Tensor, "B T D"]) -> Float[Tensor, "B L C"]:
+        """The gradient in the latents, given that in the features of :meth:`decode`."""
+        step = self.decoder.downsample
+        pulled = []
+        for (length, rows), tape in zip(self.groups, decoded.tapes, strict=True):
+            pulled.append(self._frozen.pull(tape, gradient[rows, : length * step]))
+        channels = pulled[0].shape[-1] if pulled else 0
+        latents = gradient.new_zeros(len(gradient), gradient.shape[1] // step, channels)
+        for (length, rows), part in zip(self.groups, pulled, strict=True):
+            latents[rows, :length] = part
+        return latents

@@ -1,0 +1,85 @@
+"""How strongly and how jointly the decoder's channels answer to the latents, for latents on average.
+
+Gauss-Newton needs ``G = D D^T``, where D is the decoder's Jacobian. One D costs a backward pass for every
+channel of every frame. But the decoder is a convolution: up to which rectifiers are on, its rows are copies
+of each other, shifted by tokens. So the rows of one token are taken from a few random sequences of codes; G
+is the product of the mean rows, plus what single rows scatter about the mean. It is made once for a decoder
+and a choice of channels, and serves as metric of every clip.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from controlmm.generation.frozen_decoder import FrozenDecoder
+
+WINDOW = 25  # tokens of a sequence; of a channel's answer, less than 2 % comes from farther away than 12
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivity:
+    """Answers of ``D`` channels in the ``S`` frames of one token.
+
+    Attributes:
+        mean: (D, S, W, C), the mean rows of the Jacobian: change of a channel for a unit change of each
+            latent number of the W tokens around.
+        scatter: (D, S), the mean squared length of what single rows have beyond the mean.
+    """
+
+    mean: Float[Tensor, "D S W C"]
+    scatter: Float[Tensor, "D S"]
+
+    def gram(self, tokens: int) -> Float[Tensor, "D T D T"]:
+        """``G`` for a clip of ``tokens`` tokens, float64."""
+        channels, step, window = self.mean.shape[:3]
+        rows = self.mean.flatten(0, 1).double()  # (N, W, C) with N = D S
+        lags = torch.zeros(2 * window - 1, len(rows), len(rows), dtype=torch.float64)
+        for lag in range(window):  # token s sees at w what token s + lag sees at w - lag
+            overlap = rows[:, lag:].flatten(1) @ rows[:, : window - lag].flatten(1).T
+            lags[window - 1 + lag], lags[window - 1 - lag] = overlap, overlap.T
+        token = torch.arange(tokens)
+        distance = token[None, :] - token[:, None]  # (L, L)
+        is_near = distance.abs() < window
+        blocks = lags[(distance + window - 1).clamp(0, 2 * window - 2)] * is_near[..., None, None]
+        gram = blocks.reshape(tokens, tokens, channels, step, channels, step).permute(2, 0, 3, 4, 1, 5)
+        gram = gram.reshape(channels, tokens * step, channels, tokens * step).contiguous()
+        frames = tokens * step
+        own = self.scatter.double().repeat(1, tokens).flatten()
+        gram.view(channels * frames, channels * frames).diagonal().add_(own)
+        return gram
+
+
+def measure_sensitivity(
+    decoder: FrozenDecoder,
+    latents: Float[Tensor, "S W C"],
+    channels: Sequence[int],
+    *,
+    downsample: int,
+) -> Sensitivity:
+    """Measure a decoder on some sequences.
+
+    Args:
+        decoder: What is measured.
+        latents: Sequences of W tokens like those that will be edited.
+        channels: Which channels of the decoder's output.
+        downsample: Frames for each token.
+    """
+    sequences, window, width = latents.shape
+    _, tape = decoder.forward(latents, channels)
+    count, middle = len(channels) * downsample, window // 2 * downsample
+    seeds = torch.zeros(count, window * downsample, len(channels))
+    for row in range(count):
+        seeds[row, middle + row % downsample, row // downsample] = 1
+    total, power = torch.zeros(count, window, width), torch.zeros(count)
+    for sequence in range(sequences):
+        rows = decoder.pull(tape.select(torch.full((count,), sequence)), seeds)
+        total += rows
+        power += rows.square().sum((1, 2))
+    mean, shape = total / sequences, (len(channels), downsample)
+    scatter = (power / sequences - mean.square().sum((1, 2))).clamp(min=0)
+    return Sensitivity(mean.unflatten(0, shape), scatter.unflatten(0, shape))

@@ -1,0 +1,139 @@
+"""Gauss-Newton with minimum-norm steps: as few evaluations as editing can take.
+
+The step ``J^T (J J^T + damping)^-1 r`` moves the latents least of all that remove the residual, and so stays
+nearest to what the networks made. Its matrix is not built from the decoder's Jacobian, which would cost a
+backward pass for every controlled coordinate, but from what the decoder's Jacobian is on average (see
+``sensitivity``) and the exact Jacobian of the kinematics. So a step is one pass forward and one back. What
+the average leaves is learned along the way, as by L-BFGS, in the metric that makes all residuals alike.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from controlmm.generation.control_residuals import ControlResiduals, Probe
+from controlmm.generation.solvers.clip_search import ClipRecord, Progress, report, solution_of
+from controlmm.generation.solvers.curvature import Curvature
+from controlmm.generation.solvers.metric import Metric
+from controlmm.generation.solvers.stopping import Reason, Solution, Stopping, Watch
+
+_STEPS_OF_A_METRIC = 10  # then the clip has moved so far that it is made anew
+_HISTORY = 20
+_SUFFICIENT_DECREASE = 1e-4
+_MOST_HALVINGS = 8
+_FLAT = 1e-6  # a slope below this share of the value leads nowhere in float32
+
+
+def gauss_newton(
+    residuals: ControlResiduals,
+    latents: Float[Tensor, "B L C"],
+    keep: Float[Tensor, "B L 1"],
+    stopping: Stopping,
+    *,
+    progress: Progress | None = None,
+) -> Solution:
+    """Latents that meet the targets, near where they started; each clip keeps its best iterate.
+
+    Args:
+        residuals: What should vanish.
+        latents: Where to start.
+        keep: 1 where a token may change, 0 in padding and where it is held fixed.
+        stopping: Limits; an evaluation is one pass forward, with a pass back if its point is taken.
+        progress: Called after every evaluation.
+    """
+    latents = latents.detach()
+    records = [ClipRecord(clip, kept) for clip, kept in zip(latents, keep, strict=True)]
+    descents = [_Descent(record.start, residuals, stopping.iterations) for record in records]
+    watch = Watch(stopping)
+    selected, active = residuals, list(range(len(records)))
+    while active:
+        points = [records[row].placed(descents[row].point, latents[row]) for row in active]
+        wanted: list[Tensor | None] = []
+        for row, probe in zip(active, selected.probe(torch.stack(points)), strict=True):
+            record, descent = records[row], descents[row]
+            error = (3 * probe.loss) ** 0.5
+            record.judge(descent.point, probe.loss, error)
+            record.reason = watch.verdict(loss=probe.loss, error=error, evaluations=len(record.losses))
+            wanted.append(descent.see(probe) if record.reason is None else None)
+        if any(weights is not None for weights in wanted):
+            gradients = selected.pull(wanted)
+            for row, weights, gradient in zip(active, wanted, gradients, strict=True):
+                if weights is not None:
+                    descents[row].turn(gradient[records[row].is_free].flatten())
+        for row in active:
+            records[row].reason = records[row].reason or descents[row].reason
+        still = [row for row in active if records[row].reason is None]
+        if still != active:
+            active, selected = still, residuals.select(torch.tensor(still, dtype=torch.int64))
+        report(progress, max(len(record.losses) for record in records), stopping)
+    return solution_of(records, latents, watch)
+
+
+class _Descent:
+    """The way of one clip: asks for ``point``, sees what is there, turns by the gradient."""
+
+    def __init__(
+        self, start: Float[Tensor, "N"], residuals: ControlResiduals, iterations: int | None
+    ) -> None:
+        self.point = start
+        self.reason: Reason | None = None
+        self._origin, self._direction, self._step = start, torch.zeros_like(start), 1.0
+        self._residuals, self._iterations, self._done = residuals, iterations, -1
+        self._memory = Curvature(_HISTORY)
+        self._metric: Metric | None = None
+        self._value, self._slope = math.inf, 0.0
+        self._gradient: Tensor | None = None
+        self._halvings = 0
+
+    def see(self, probe: Probe) -> Float[Tensor, "N"] | None:
+        """Weights of the gradient wanted here; ``None`` if the point is refused for a nearer one."""
+        if self._metric is None:
+            self._renew(probe)
+        assert self._metric is not None
+        value, weights = self._metric.weigh(probe.residual)
+        if not value <= self._value + _SUFFICIENT_DECREASE * self._step * self._slope:
+            self._shorten(value)
+            return None
+        self._done += 1
+        if self._done and self._done % _STEPS_OF_A_METRIC == 0:
+            self._renew(probe)
+            value, weights = self._metric.weigh(probe.residual)
+        self._value = value
+        return weights
+
+    def turn(self, gradient: Float[Tensor, "N"]) -> None:
+        """Choose where to go from the latest point."""
+        if self._gradient is not None:
+            self._memory.add(self.point - self._origin, gradient - self._gradient)
+        if self._iterations is not None and self._done >= self._iterations:
+            self.reason = "iterations"
+            return
+        self._origin, self._gradient = self.point, gradient
+        self._direction = self._memory.direction(gradient)
+        self._slope = (gradient @ self._direction).item()
+        if self._slope >= -_FLAT * self._value:
+            self.reason = "converged"
+            return
+        self._step, self._halvings = 1.0, 0
+        self.point = self._origin + self._direction
+
+    def _renew(self, probe: Probe) -> None:
+        """The metric of the clip as it now is; gradients of the old one cannot be compared with new ones."""
+        self._metric = Metric(probe.rows(), self._residuals.channel_gram(len(probe.features)), probe.mask)
+        self._memory.clear()
+        self._gradient = None
+
+    def _shorten(self, value: float) -> None:
+        """Go back towards the origin, to the minimum of the parabola through what is known of the line."""
+        self._halvings += 1
+        if self._halvings > _MOST_HALVINGS:
+            self.reason = "converged"
+            return
+        excess = value - self._value - self._slope * self._step
+        best = -0.5 * self._slope * self._step**2 / excess if excess > 0 else 0.0
+        self._step = min(max(best, 0.1 * self._step), 0.5 * self._step)
+        self.point = self._origin + self._step * self._direction
