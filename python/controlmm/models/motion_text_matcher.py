@@ -44,7 +44,7 @@ class MatcherConfig:
 
     @classmethod
     def small(cls) -> MatcherConfig:
-        """The size that ships: 1.3 M parameters."""
+        """The size that ships: 1.15 M parameters."""
         return cls()
 
     @classmethod
