@@ -85,6 +85,18 @@ def test_a_stopped_run_goes_on_and_gives_the_same_numbers(
     assert json.dumps(resumed) == json.dumps(unbroken)
 
 
+def test_more_repeats_go_on_where_fewer_ended(
+    tiny_pipeline: ControlMM, test_set: TestSet, evaluator: Evaluator, tmp_path: Path
+) -> None:
+    row = Row("quick", Generated(tiny_pipeline, QUICK), ControlSetting("pelvis"))
+    evaluate_rows([row], test_set, evaluator, Protocol(repeats=1), tmp_path, progress=False)
+    (first,) = tmp_path.rglob("*.safetensors")
+    written = first.stat().st_mtime_ns
+    (scores,) = evaluate_rows([row], test_set, evaluator, Protocol(repeats=2), tmp_path, progress=False)
+    assert first.stat().st_mtime_ns == written
+    assert len(scores.repeats["fid"]) == 2
+
+
 def test_a_clips_result_does_not_depend_on_its_batch(
     tiny_pipeline: ControlMM, test_set: TestSet, evaluator: Evaluator, tmp_path: Path
 ) -> None:

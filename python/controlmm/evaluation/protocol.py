@@ -98,7 +98,7 @@ def evaluate_rows(
         )
     folders = _folders(rows, Path(out))
     shared = {
-        "protocol": asdict(protocol), "data": test_set.sha256, "captions": list(test_set.kinds),
+        "protocol": _identity(protocol), "data": test_set.sha256, "captions": list(test_set.kinds),
         "split": test_set.split, "evaluator": evaluator.name,
     }  # fmt: skip
     abouts = []
@@ -186,6 +186,13 @@ def _fid_of_another_draw(
         lengths = torch.tensor([sample.length for sample in group])
         embeddings.append(evaluator.embed_motions(padded_features(group), lengths))
     return frechet_distance(torch.cat([batch.real for batch in batches]), torch.cat(embeddings))
+
+
+def _identity(protocol: Protocol) -> dict[str, Any]:
+    """All but the number of repeats: more of them go on where fewer ended."""
+    fields = asdict(protocol)
+    del fields["repeats"]
+    return fields
 
 
 def _folders(rows: Sequence[Row], out: Path) -> list[Path]:
