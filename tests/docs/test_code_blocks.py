@@ -20,7 +20,7 @@ import torch
 from published_layout import SMALL, write_published
 
 from controlmm.controls import load_controls
-from controlmm.pipelines.folder import PIPELINE_FILE, shipped_folder
+from controlmm.pipelines.folder import PIPELINE_FILE, SHIPPED, shipped_folder
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md")))
@@ -106,7 +106,8 @@ def _write_clips(folder: Path, walk: Callable[..., torch.Tensor]) -> None:
 def test_code_runs(block: Block, folder_of: Callable[[Path], Path]) -> None:
     if block.note.startswith("not run: "):
         pytest.skip(block.note.removeprefix("not run: "))
-    has_model = (shipped_folder() / PIPELINE_FILE).is_file()
+    model = SHIPPED["tlcontrol" if block.note == "needs the model tlcontrol" else "controlmm"]
+    has_model = (shipped_folder(model) / PIPELINE_FILE).is_file()
     if block.note.startswith("needs the model") and not has_model:
         pytest.skip("the trained model is not in this installation")
     interpreter = [sys.executable, "-c"] if block.language == "python" else ["bash", "-euo", "pipefail", "-c"]

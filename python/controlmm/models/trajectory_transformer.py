@@ -23,7 +23,7 @@ _STEPS_A_SECOND = 20.0  # scales the difference of two frames of a walk to about
 
 @dataclass(frozen=True)
 class TrajectoryTransformerConfig:
-    """Two transformer stages over one token for every joint and bundle of frames."""
+    """Two transformer stages from bundles of frames to the codes of the body parts."""
 
     codebook_size: int = 128  # codes of each part
     width: int = 512
@@ -40,9 +40,10 @@ class TrajectoryTransformerConfig:
     downsample: int = 4  # frames in a bundle
     max_tokens: int = 49  # longest clip, in bundles
     joints: tuple[int, ...] = trajectory_joints(HUMANML3D)  # in the order of the body parts
-    # "published": a coordinate that is not given looks like the mean position, tokens know only their place
-    # in the flat sequence, padding is attended. "masked" also says which coordinates are given and how they
-    # move, names joint and time apart, leaves padding out, and has an output layer for each part.
+    # "published": a token for every joint and bundle in both stages; a coordinate that is not given looks
+    # like the mean position; tokens know only their place in the flat sequence; padding is attended.
+    # "masked" also sees which coordinates are given and how they move, leaves padding out, has one token for
+    # all joints of a bundle in the first stage (half the time), and an output layer for each part.
     form: Literal["masked", "published"] = "masked"
 
     def __post_init__(self) -> None:
@@ -61,13 +62,13 @@ class TrajectoryTransformerConfig:
 
     @classmethod
     def small(cls) -> TrajectoryTransformerConfig:
-        """The size that ships: 2.6 M parameters, MiniLM text."""
+        """The size that ships: 3.1 M parameters, MiniLM text."""
         return cls(
             codebook_size=256,
-            width=192,
-            layers=4,
+            width=224,
             feedforward=768,
             head_width=128,
+            head_layers=2,
             head_feedforward=512,
             dropout=0.0,
             text_dim=384,
@@ -111,10 +112,7 @@ class TrajectoryTransformerConfig:
 
 
 class TrajectoryTransformer(PretrainedModel):
-    """Predicts the codes of all parts at once, without iterations.
-
-    Sequence: one text token, then time-major one token for each of the six joints.
-    """
+    """Predicts the codes of all parts at once, without iterations."""
 
     config_class: ClassVar[type] = TrajectoryTransformerConfig
     training_state: ClassVar[tuple[str, ...]] = ("batches_seen",)
@@ -134,20 +132,20 @@ class TrajectoryTransformer(PretrainedModel):
             activation="relu" if is_published else "gelu",
         )
         self.text_proj = nn.Linear(config.text_dim, config.width)
-        self.bundle_proj = nn.Linear(config.coordinates * (1 if is_published else 3), config.width)
+        parts, inputs = config.num_parts, config.coordinates
+        self.bundle_proj = nn.Linear(inputs if is_published else 3 * parts * inputs, config.width)
         self.dropout = nn.Dropout(config.dropout)
         self.layers = layers(config.layers, width=config.width, feedforward=config.feedforward)
-        self.to_head = nn.Linear(config.width, config.head_width)
+        self.to_head = nn.Linear(config.width, config.head_width * (1 if is_published else parts))
         self.head_layers = layers(
             config.head_layers, width=config.head_width, feedforward=config.head_feedforward
         )
-        outputs = 1 if is_published else config.num_parts
         self.to_codes = nn.ModuleList(
-            nn.Linear(config.head_width, config.codebook_size) for _ in range(outputs)
+            nn.Linear(config.head_width, config.codebook_size) for _ in range(1 if is_published else parts)
         )
-        longest = 1 + config.max_tokens * config.num_parts if is_published else config.max_tokens
+        longest = 1 + config.max_tokens * parts if is_published else config.max_tokens
         self.register_buffer("positions", sinusoidal_positions(longest, config.width), persistent=False)
-        self.joint_embedding = None if is_published else nn.Embedding(config.num_parts, config.width)
+        self.part_embedding = None if is_published else nn.Embedding(parts, config.head_width)
         self.register_buffer("batches_seen", torch.tensor(0))
         self.register_buffer("trajectory_mean", torch.tensor(_PUBLISHED_MEAN))
         self.register_buffer("trajectory_std", torch.tensor(_PUBLISHED_STD))
@@ -179,24 +177,46 @@ class TrajectoryTransformer(PretrainedModel):
         Raises:
             ValueError: If there are more tokens than ``max_tokens``.
         """
-        config, length = self.config, valid.shape[1]
-        if length > config.max_tokens:
-            raise ValueError(f"At most {config.max_tokens} tokens are possible, got {length}.")
-        text_token = self.text_proj(text * config.text_scale)[:, None]
-        tokens = self.bundle_proj(self._bundles(trajectories, given))  # (B, L, P, W)
-        if self.joint_embedding is None:
-            sequence = torch.cat([text_token, tokens.flatten(1, 2)], dim=1)
-            sequence = sequence + self.positions[: sequence.shape[1]]
-            attended = torch.ones(sequence.shape[:2], dtype=torch.bool)
-        else:
-            tokens = tokens + self.positions[:length, None] + self.joint_embedding.weight
-            sequence = torch.cat([text_token, tokens.flatten(1, 2)], dim=1)
-            attended = with_text_token(valid.repeat_interleave(config.num_parts, dim=1))
-        hidden = run_layers(self.layers, self.dropout(sequence), attended)
-        hidden = run_layers(self.head_layers, self.to_head(hidden), attended)[:, 1:]
-        by_part = hidden.unflatten(1, (length, config.num_parts)).unbind(2)
-        outputs = self.to_codes if len(self.to_codes) > 1 else [self.to_codes[0]] * config.num_parts
-        return torch.stack([out(part) for out, part in zip(outputs, by_part, strict=True)], dim=2)
+        if valid.shape[1] > self.config.max_tokens:
+            raise ValueError(f"At most {self.config.max_tokens} tokens are possible, got {valid.shape[1]}.")
+        text_token = self.text_proj(text * self.config.text_scale)[:, None]
+        bundles = self._bundles(trajectories, given)
+        if self.part_embedding is None:
+            hidden = self._published(text_token, bundles)
+            return torch.stack([self.to_codes[0](part) for part in hidden.unbind(2)], dim=2)
+        hidden = self._masked(text_token, bundles, valid, self.part_embedding.weight)
+        by_part = zip(self.to_codes, hidden.unbind(2), strict=True)
+        return torch.stack([out(part) for out, part in by_part], dim=2)
+
+    def _published(
+        self, text_token: Float[Tensor, "B 1 W"], bundles: Float[Tensor, "B L P I"]
+    ) -> Float[Tensor, "B L P H"]:
+        """The sequence is the text token, then time-major every joint's bundle."""
+        tokens = self.bundle_proj(bundles).flatten(1, 2)
+        sequence = torch.cat([text_token, tokens], dim=1)
+        sequence = self.dropout(sequence + self.positions[: sequence.shape[1]])
+        everything = torch.ones(sequence.shape[:2], dtype=torch.bool)
+        hidden = run_layers(self.layers, sequence, everything)
+        hidden = run_layers(self.head_layers, self.to_head(hidden), everything)
+        by_part: Tensor = hidden[:, 1:].unflatten(1, bundles.shape[1:3])
+        return by_part
+
+    def _masked(
+        self,
+        text_token: Float[Tensor, "B 1 W"],
+        bundles: Float[Tensor, "B L P I"],
+        valid: Bool[Tensor, "B L"],
+        part_embedding: Float[Tensor, "P H"],
+    ) -> Float[Tensor, "B L P H"]:
+        """First the text token and a token for each bundle of all joints, then a token for each part."""
+        tokens = self.bundle_proj(bundles.flatten(2)) + self.positions[: bundles.shape[1]]
+        sequence = self.dropout(torch.cat([text_token, tokens], dim=1))
+        hidden = run_layers(self.layers, sequence, with_text_token(valid))[:, 1:]
+        parts = self.to_head(hidden).unflatten(2, part_embedding.shape) + part_embedding
+        of_part = valid.repeat_interleave(len(part_embedding), dim=1)
+        hidden = run_layers(self.head_layers, parts.flatten(1, 2), of_part)
+        by_part: Tensor = hidden.unflatten(1, bundles.shape[1:3])
+        return by_part
 
     def _bundles(
         self, trajectories: Float[Tensor, "B T P 3"], given: Bool[Tensor, "B T P 3"]

@@ -43,7 +43,7 @@ SETTINGS = {
         clip_norm=0.0,
         bf16=False,
     ),
-    "small": TrainingSettings(steps=1800, batch_size=32, learning_rate=6e-4, warmup=150, weight_decay=0.01),
+    "small": TrainingSettings(steps=2000, batch_size=32, learning_rate=6e-4, warmup=150, weight_decay=0.01),
     "tiny": masked.SETTINGS["tiny"],
 }
 

@@ -67,7 +67,7 @@ def mixed_trajectories(
         else:
             share = torch.rand(()).item()
             for joint in chosen:
-                clip[:, joint] = ~_segments(len(clip), share, span=length)[:, None]
+                clip[:, joint] = ~hide_segments(len(clip), share, span=length)[:, None]
     return given
 
 
@@ -105,10 +105,10 @@ def _kept_joints(joints: int, *, kept: int) -> Bool[Tensor, "P 1"]:
 
 
 def _segment_mask(length: int, joints: int, share: float) -> Bool[Tensor, "T P 1"]:
-    return ~torch.stack([_segments(length, share, span=length) for _ in range(joints)], dim=1)[..., None]
+    return ~torch.stack([hide_segments(length, share, span=length) for _ in range(joints)], dim=1)[..., None]
 
 
-def _segments(frames: int, share: float, *, span: int) -> Bool[Tensor, "T"]:
+def hide_segments(frames: int, share: float, *, span: int) -> Bool[Tensor, "T"]:
     """True in random segments of at most 15 frames that cover ``share`` of the first ``span`` frames."""
     hidden = torch.zeros(frames, dtype=torch.bool)
     wanted = round(share * span)
