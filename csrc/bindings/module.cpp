@@ -88,6 +88,13 @@ void register_kernels(Module& m) {
       },
       Unlocked());
   m.def(
+      "control_value_and_grad",
+      [](Arg decoded, Arg mean, Arg std, Arg targets, Arg mask, int norm, Arg loss, Arg gradient, int threads) {
+        guidance_value_and_grad(decoded.view(), mean.view(), std.view(), targets.view(), mask.view(), norm_of(norm),
+                                loss.view(), gradient.view(), threads);
+      },
+      Unlocked());
+  m.def(
       "gumbel_noise",
       [](std::uint64_t seed, std::int64_t first_clip, Arg noise, int threads) {
         gumbel_noise({seed, first_clip}, noise.view(), threads);

@@ -31,23 +31,22 @@ struct PointMask {
 template <class T>
 CONTROLMM_INLINE PointMask<T> load_point_mask(const std::uint8_t* p, std::int64_t joint, std::int64_t coord,
                                               std::int64_t n) {
-  using Int = typename IntOf<T>::type;
   PointMask<T> mask;
   mask.joints = mask.coords = 0;
-  Int buffer[3][kLanes] = {};
+  std::uint8_t buffer[3][kLanes] = {};
   for (std::int64_t i = 0; i < n; ++i) {
     const std::uint8_t* at = p + i * joint;
     const int x = at[0] != 0, y = at[coord] != 0, z = at[2 * coord] != 0;
-    buffer[0][i] = -x;
-    buffer[1][i] = -y;
-    buffer[2][i] = -z;
+    buffer[0][i] = at[0];
+    buffer[1][i] = at[coord];
+    buffer[2][i] = at[2 * coord];
     mask.coords += x + y + z;
     mask.joints += x | y | z;
   }
   mask.is_empty = mask.joints == 0;
-  mask.x = load(buffer[0]);
-  mask.y = load(buffer[1]);
-  mask.z = load(buffer[2]);
+  mask.x = load_mask<T>(buffer[0]);
+  mask.y = load_mask<T>(buffer[1]);
+  mask.z = load_mask<T>(buffer[2]);
   return mask;
 }
 
@@ -57,29 +56,24 @@ CONTROLMM_INLINE Points<T> masked_difference(const Points<T>& a, const Points<T>
 }
 
 template <class T>
-CONTROLMM_INLINE Lanes<T> penalty(const Points<T>& d, Norm norm) {
-  if (norm == Norm::l1) return abs(d.x) + abs(d.y) + abs(d.z);
+struct Penalty {
+  Lanes<T> value;
+  Points<T> gradient;  // of scale * value
+};
+
+// Value and gradient together: the root of the distance serves both.
+template <class T>
+CONTROLMM_INLINE Penalty<T> penalty_of(const Points<T>& d, Norm norm, const Lanes<T>& scale) {
+  if (norm == Norm::l1)
+    return {abs(d.x) + abs(d.y) + abs(d.z), {scale * sign(d.x), scale * sign(d.y), scale * sign(d.z)}};
   const Lanes<T> squared = d.x * d.x + d.y * d.y + d.z * d.z;
-  return norm == Norm::mse ? squared : sqrt(squared);
-}
-
-template <class T>
-CONTROLMM_INLINE Lanes<T> sign(const Lanes<T>& a) {
-  const Lanes<T> zero = zeros<T>(), one = broadcast(T{1});
-  // A NaN stays NaN: a broken position must show, not look like a perfect one.
-  return select(a > zero, one, select(a < zero, zero - one, a));
-}
-
-template <class T>
-CONTROLMM_INLINE Points<T> penalty_gradient(const Points<T>& d, Norm norm, const Lanes<T>& scale) {
-  if (norm == Norm::l1) return {scale * sign(d.x), scale * sign(d.y), scale * sign(d.z)};
   if (norm == Norm::mse) {
     const Lanes<T> twice = scale + scale;
-    return {twice * d.x, twice * d.y, twice * d.z};
+    return {squared, {twice * d.x, twice * d.y, twice * d.z}};
   }
-  const Lanes<T> distance = penalty(d, Norm::l2);
+  const Lanes<T> distance = sqrt(squared);
   const Lanes<T> inverse = select(distance == zeros<T>(), zeros<T>(), scale / distance);
-  return {d.x * inverse, d.y * inverse, d.z * inverse};
+  return {distance, {d.x * inverse, d.y * inverse, d.z * inverse}};
 }
 
 // Runs of joints with one stride. A clip whose frames follow one another is a single long run.
@@ -105,7 +99,7 @@ CONTROLMM_INLINE void for_each_tile(const ConsistencyArgs<T>& a, std::int64_t cl
   const Runs runs = runs_of(a);
   for (std::int64_t run = 0; run < runs.count; ++run) {
     for (std::int64_t i = 0; i < runs.length; i += kLanes) {
-      const std::int64_t n = runs.length - i < kLanes ? runs.length - i : kLanes;
+      const std::int64_t n = lanes_left(runs.length, i);
       const std::uint8_t* at = a.mask.data + clip * a.mask.clip + run * a.mask.frame + i * a.mask.joint;
       const PointMask<T> mask = load_point_mask<T>(at, a.mask.joint, a.mask.coord, n);
       if (mask.is_empty) continue;
@@ -124,7 +118,7 @@ void consistency(const ConsistencyArgs<T>& args, ClipRange clips) {
     Lanes<double> total = zeros<double>();
     std::int64_t count = 0;
     for_each_tile(args, clip, [&](std::int64_t, std::int64_t, const PointMask<T>& mask, const Points<T>& difference) {
-      total = total + to_double(penalty(difference, args.norm));
+      total = total + to_double(penalty_of(difference, args.norm, zeros<T>()).value);
       count += args.norm == Norm::l2 ? mask.joints : mask.coords;
     });
     args.sums[clip] = sum(total);
@@ -140,7 +134,7 @@ void consistency_backward(const ConsistencyArgs<T>& args, ClipRange clips) {
     __builtin_memset(grad, 0, static_cast<std::size_t>(values) * sizeof(T));
     const Lanes<T> scale = broadcast(args.scales[clip]);
     for_each_tile(args, clip, [&](std::int64_t first, std::int64_t n, const PointMask<T>& mask, const Points<T>& d) {
-      const Points<T> g = penalty_gradient(d, args.norm, scale);
+      const Points<T> g = penalty_of(d, args.norm, scale).gradient;
       const Lanes<T> zero = zeros<T>();
       store_points(grad + 3 * first, n,
                    Points<T>{select(mask.x, g.x, zero), select(mask.y, g.y, zero), select(mask.z, g.z, zero)});

@@ -36,21 +36,6 @@ constexpr double kInverseFactorial[] = {1.0,
                                         1.0 / 6227020800.0,
                                         1.0 / 87178291200.0};
 
-template <class To, class From>
-CONTROLMM_INLINE Lanes<To> bits_of(const Lanes<From>& a) {
-  Lanes<To> b;
-  static_assert(sizeof a == sizeof b);
-  __builtin_memcpy(&b, &a, sizeof b);
-  return b;
-}
-
-template <class To, class From>
-CONTROLMM_INLINE Lanes<To> converted(const Lanes<From>& a) {
-  using Reg = typename Lanes<To>::Reg;
-  return map_parts<To>([](auto x) __attribute__((always_inline)) { return __builtin_convertvector(x, Reg); }, a,
-                       Parts<From>{});
-}
-
 // Natural logarithm of positive normal numbers: x = m 2^e with m in [sqrt(1/2), sqrt(2)),
 // log m = 2 artanh((m - 1) / (m + 1)) as a series.
 template <class T>

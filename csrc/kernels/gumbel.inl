@@ -20,7 +20,7 @@ CONTROLMM_INLINE void for_each_noise_block(const GumbelArgs<T>& args, std::int64
     for (int w = 0; w < 4; ++w) {
       const std::int64_t first = (4 * group + w) * kLanes;
       if (first >= args.codes) return;
-      const std::int64_t count = args.codes - first < kLanes ? args.codes - first : kLanes;
+      const std::int64_t count = lanes_left(args.codes, first);
       visit(first, count, gumbel_of<T>(words.w[w]));
     }
   }
@@ -71,7 +71,7 @@ CONTROLMM_INLINE void softmax_row(T* z, std::int64_t codes, T largest, T tempera
   const Lanes<T> top = broadcast(largest), inverse = broadcast(T{1} / temperature);
   Lanes<T> total = zeros<T>();
   for (std::int64_t k = 0; k < codes; k += kLanes) {
-    const std::int64_t count = codes - k < kLanes ? codes - k : kLanes;
+    const std::int64_t count = lanes_left(codes, k);
     Lanes<T> e = exp_of_nonpositive((load_strided(z + k, 1, count) - top) * inverse);
     if (count < kLanes) e = select(first_lanes<T>(count), e, zeros<T>());
     store_strided(z + k, 1, count, e);
@@ -79,7 +79,7 @@ CONTROLMM_INLINE void softmax_row(T* z, std::int64_t codes, T largest, T tempera
   }
   const Lanes<T> share = broadcast(T{1} / sum(total));
   for (std::int64_t k = 0; k < codes; k += kLanes) {
-    const std::int64_t count = codes - k < kLanes ? codes - k : kLanes;
+    const std::int64_t count = lanes_left(codes, k);
     store_strided(z + k, 1, count, load_strided(z + k, 1, count) * share);
   }
 }
@@ -111,13 +111,13 @@ void softmax_backward(const SoftmaxArgs<T>& args, ClipRange rows) {
     T* g = args.gradient + row * args.codes;
     Lanes<T> products = zeros<T>();
     for (std::int64_t k = 0; k < args.codes; k += kLanes) {
-      const std::int64_t count = args.codes - k < kLanes ? args.codes - k : kLanes;
+      const std::int64_t count = lanes_left(args.codes, k);
       const Lanes<T> product = load_strided(p + k, 1, count) * load_strided(g + k, 1, count);
       products = products + (count < kLanes ? select(first_lanes<T>(count), product, zeros<T>()) : product);
     }
     const Lanes<T> mean = broadcast(sum(products)), scale = broadcast(args.inverse_temperature);
     for (std::int64_t k = 0; k < args.codes; k += kLanes) {
-      const std::int64_t count = args.codes - k < kLanes ? args.codes - k : kLanes;
+      const std::int64_t count = lanes_left(args.codes, k);
       const Lanes<T> centred = load_strided(g + k, 1, count) - mean;
       store_strided(g + k, 1, count, load_strided(p + k, 1, count) * centred * scale);
     }

@@ -33,16 +33,14 @@ CONTROLMM_INLINE void sine_cosine(const Lanes<double>& angle, Lanes<double>& sin
     c = c * r2 + all(k);
   c = all(1.0) + r2 * c;
 
-  // The low bits of the shifted value are the quadrant.
-  Lanes<std::int64_t> bits;
-  __builtin_memcpy(&bits, &shifted, sizeof bits);
-  const Lanes<std::int64_t> one = broadcast(std::int64_t{1});
-  const Mask<double> is_odd = zeros<std::int64_t>() - (bits & one);
-  const Mask<double> sine_negative = zeros<std::int64_t>() - ((bits >> one) & one);
-  const Mask<double> cosine_negative = zeros<std::int64_t>() - (((bits + one) >> one) & one);
-  const Lanes<double> raw_sine = select(is_odd, c, s), raw_cosine = select(is_odd, s, c);
-  sine = select(sine_negative, zeros<double>() - raw_sine, raw_sine);
-  cosine = select(cosine_negative, zeros<double>() - raw_cosine, raw_cosine);
+  // The low bits of the shifted value are the quadrant: the first swaps sine and cosine, the second is their sign.
+  const Lanes<std::int64_t> bits = bits_of<std::int64_t>(shifted), one = broadcast(std::int64_t{1});
+  const auto sign_from = [](const Lanes<std::int64_t>& low, std::int64_t bit) {
+    return (low << broadcast(63 - bit)) & broadcast(std::numeric_limits<std::int64_t>::min());
+  };
+  const Mask<double> is_odd = bits_of<double>(bits_of<std::int64_t>(all(1)) | sign_from(bits, 0)) < all(0);
+  sine = bits_of<double>(bits_of<std::int64_t>(select(is_odd, c, s)) ^ sign_from(bits, 1));
+  cosine = bits_of<double>(bits_of<std::int64_t>(select(is_odd, s, c)) ^ sign_from(bits + one, 1));
 }
 
 // Past this the three-part reduction loses digits; such angles mean nothing but must stay right.

@@ -3,6 +3,7 @@
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
+#include <limits>
 #include <type_traits>
 #include <utility>
 
@@ -24,10 +25,13 @@ namespace {
 // In this order: each file is written in terms of those above it.
 // clang-format off
 #include "simd.inl"
+#include "mask.inl"
+#include "strided.inl"
 #include "heading.inl"
 #include "recover_joints.inl"
 #include "consistency.inl"
 #include "obstacles.inl"
+#include "controlled_joints.inl"
 #include "guidance.inl"
 #include "philox.inl"
 #include "exponential.inl"

@@ -82,6 +82,7 @@ struct GuidanceArgs {
   Strided4<const std::uint8_t> mask;
   Norm norm;
   ObstacleArgs<T> obstacles;
+  bool frames_are_neighbours;     // in `decoded`, `targets`, `mask` and `gradient`
   const double* obstacle_scales;  // one a clip
   T* loss;
   Strided3<T> gradient;
@@ -154,9 +155,9 @@ static constexpr std::int64_t kinematics_scratch(const MotionShape& shape) {
 /// Doubles of scratch memory for the obstacles of sixteen frames.
 static constexpr std::int64_t obstacle_scratch(std::int64_t count) { return count * kObstacleParameters * kLanes; }
 
-/// Doubles of scratch memory for the fused kernel: time series, obstacles, and one flag a joint.
+/// Doubles of scratch memory for the fused kernel: time series, obstacles, a list of joints, and one flag a joint.
 static constexpr std::int64_t guidance_scratch(const MotionShape& shape, std::int64_t obstacles) {
-  return 14 * round_up_to_lanes(shape.frames) + obstacle_scratch(obstacles) + shape.joints;
+  return 14 * round_up_to_lanes(shape.frames) + obstacle_scratch(obstacles) + 2 * shape.joints;
 }
 
 const KernelTable& active_kernels();

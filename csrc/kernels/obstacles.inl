@@ -44,28 +44,38 @@ CONTROLMM_INLINE Points<T> nearest_on_segment_offset(const Points<T>& p, const S
   return from_a - axis * select(along < zero, zero, select(along > one, one, along));
 }
 
+// A point as an oriented box sees it: along its axes, and how far past its faces.
 template <class T>
-CONTROLMM_INLINE Distance<T> distance_to_box(const Points<T>& p, const Staged<T>& s) {
-  const Points<T> offset = p - s.point(0), half = s.point(3);
-  const Points<T> row0 = s.point(6), row1 = s.point(9), row2 = s.point(12);
+struct InBox {
+  Points<T> local, beyond;
+};
+
+template <class T>
+CONTROLMM_INLINE InBox<T> point_in_box(const Points<T>& p, const Staged<T>& s) {
+  const Points<T> offset = p - s.point(0), row0 = s.point(6), row1 = s.point(9), row2 = s.point(12);
   const Points<T> local = {offset.x * row0.x + offset.y * row1.x + offset.z * row2.x,
                            offset.x * row0.y + offset.y * row1.y + offset.z * row2.y,
                            offset.x * row0.z + offset.y * row1.z + offset.z * row2.z};
-  const Points<T> beyond = Points<T>{abs(local.x), abs(local.y), abs(local.z)} - half;
+  return {local, Points<T>{abs(local.x), abs(local.y), abs(local.z)} - s.point(3)};
+}
+
+template <class T>
+CONTROLMM_INLINE Distance<T> distance_to_box(const InBox<T>& p, const Staged<T>& s) {
+  const Points<T>&local = p.local, &beyond = p.beyond;
   const Lanes<T> zero = zeros<T>(), one = broadcast(T{1});
   const auto positive = [&](const Lanes<T>& a) { return select(a <= zero, zero, a); };
   const Points<T> outside = {positive(beyond.x), positive(beyond.y), positive(beyond.z)};
   const Distance<T> corner = distance_to_ball(outside, zero);
   // Inside, the nearest face: the axis with the largest value, the first one on ties.
   const Mask<T> x_wins = (beyond.x >= beyond.y) & (beyond.x >= beyond.z);
-  const Mask<T> y_wins = negated(x_wins) & (beyond.y >= beyond.z);
+  const Mask<T> y_wins = ~x_wins & (beyond.y >= beyond.z);
   const Lanes<T> deepest = select(x_wins, beyond.x, select(y_wins, beyond.y, beyond.z));
   const Mask<T> is_inside = deepest < zero;
   const Points<T> face = {select(x_wins, one, zero), select(y_wins, one, zero), select(x_wins | y_wins, zero, one)};
   const Points<T> n = {select(is_inside, face.x, corner.normal.x) * sign(local.x),
                        select(is_inside, face.y, corner.normal.y) * sign(local.y),
                        select(is_inside, face.z, corner.normal.z) * sign(local.z)};
-  return {select(is_inside, deepest, corner.value), {dot(row0, n), dot(row1, n), dot(row2, n)}};
+  return {select(is_inside, deepest, corner.value), {dot(s.point(6), n), dot(s.point(9), n), dot(s.point(12), n)}};
 }
 
 template <class T>
@@ -132,20 +142,34 @@ template <class T>
 CONTROLMM_INLINE void add_collision(Collision<T>& sum, const Distance<T>& distance, const Lanes<T>& clearance,
                                     const Mask<T>& counts) {
   const Lanes<T> depth = clearance - distance.value, zero = zeros<T>();
-  const Mask<T> hits = negated(depth <= zero) & counts;  // a NaN depth hits: it must show
+  const Mask<T> hits = ~(depth <= zero) & counts;  // a NaN depth hits: it must show
   sum.depth = sum.depth + select(hits, depth, zero);
   sum.gradient.x = sum.gradient.x - select(hits, distance.normal.x, zero);
   sum.gradient.y = sum.gradient.y - select(hits, distance.normal.y, zero);
   sum.gradient.z = sum.gradient.z - select(hits, distance.normal.z, zero);
 }
 
-// Round obstacles: without any frame near enough, the root and the division are saved.
+// Without any frame near enough, the root and the division are saved. The slack covers their rounding, so that what is
+// left out is exactly 0.
+constexpr double kSlack = 1.0001;
+
 template <class T>
 CONTROLMM_INLINE void collide_with_ball(Collision<T>& sum, const Points<T>& offset, const Lanes<T>& radius,
                                         const Lanes<T>& clearance, const Mask<T>& counts) {
-  const Lanes<T> reach = radius + clearance, slack = broadcast(T(1.0001));
-  if (!any(negated(dot(offset, offset) > reach * reach * slack) & counts)) return;
+  const Lanes<T> reach = radius + clearance, slack = broadcast(T(kSlack));
+  if (!any(~(dot(offset, offset) > reach * reach * slack) & counts)) return;
   add_collision(sum, distance_to_ball(offset, radius), clearance, counts);
+}
+
+template <class T>
+CONTROLMM_INLINE void collide_with_box(Collision<T>& sum, const Points<T>& p, const Staged<T>& s,
+                                       const Lanes<T>& clearance, const Mask<T>& counts) {
+  const InBox<T> in = point_in_box(p, s);
+  const Points<T>& beyond = in.beyond;
+  const Lanes<T> reach = clearance * broadcast(T(kSlack)), total = beyond.x + beyond.y + beyond.z;
+  const Mask<T> is_far = (beyond.x > reach) | (beyond.y > reach) | (beyond.z > reach), is_number = total == total;
+  if (!any(~(is_far & is_number) & counts)) return;
+  add_collision(sum, distance_to_box(in, s), clearance, counts);
 }
 
 template <class T>
@@ -157,7 +181,7 @@ CONTROLMM_INLINE void collide(Collision<T>& sum, const Points<T>& p, const std::
     case ObstacleKind::capsule:
       return collide_with_ball(sum, nearest_on_segment_offset(p, s), s.scalar(6), clearance, counts);
     case ObstacleKind::box:
-      return add_collision(sum, distance_to_box(p, s), clearance, counts);
+      return collide_with_box(sum, p, s, clearance, counts);
     case ObstacleKind::plane:
       return add_collision(sum, distance_to_plane(p, s), clearance, counts);
     case ObstacleKind::half_space:
@@ -175,28 +199,24 @@ inline void stage_obstacles(const ObstacleArgs<T>& args, std::int64_t clip, std:
   const Strided4<const T>& p = args.parameters;
   for (std::int64_t o = 0; o < args.count; ++o, staged += kObstacleParameters * kLanes) {
     const T* from = p.data + clip * p.clip + first * p.frame + o * p.joint;
-    for (int i = 0; i < kParametersOf[args.kinds[4 * o]]; ++i)
-      store(staged + i * kLanes, load_strided(from + i * p.coord, p.frame, n));
+    for (int i = 0; i < kParametersOf[args.kinds[4 * o]]; ++i) {
+      const T* row = from + i * p.coord;
+      __builtin_prefetch(row + kLanes * p.frame);  // wanted by the next sixteen frames
+      store(staged + i * kLanes, load_strided(row, p.frame, n));
+    }
   }
 }
 
+// Too long to be worth a copy in each of its callers. Sums in a local variable stay in registers.
 template <class T>
-CONTROLMM_INLINE Mask<T> first_lanes(std::int64_t n) {
-  using Int = typename IntOf<T>::type;
-  Int lanes[kLanes];
-  for (std::int64_t i = 0; i < kLanes; ++i) lanes[i] = i < n ? -1 : 0;
-  return load(lanes);
-}
-
-template <class T>
-CONTROLMM_INLINE Collision<T> collide_with_all(const ObstacleArgs<T>& args, const T* staged, std::int64_t joint,
-                                               const Points<T>& p, const Mask<T>& counts) {
+__attribute__((noinline)) void collide_with_all(const ObstacleArgs<T>& args, const T* staged, std::int64_t joint,
+                                                const Points<T>& p, const Mask<T>& counts, Collision<T>& out) {
   Collision<T> sum = {zeros<T>(), {zeros<T>(), zeros<T>(), zeros<T>()}};
   const Lanes<T> clearance = broadcast(args.margin + args.radii[joint]);
   for (std::int64_t o = 0; o < args.count; ++o)
     collide(sum, p, args.kinds + 4 * o, Staged<T>{staged + o * kObstacleParameters * kLanes}, args.heights, clearance,
             counts);
-  return sum;
+  out = sum;
 }
 
 template <class T, class F>
@@ -205,13 +225,15 @@ CONTROLMM_INLINE void for_each_collision(const ObstacleLossArgs<T>& args, std::i
   const Strided4<const T>& a = args.joints;
   const std::int64_t length = obstacles.lengths[clip];
   for (std::int64_t t = 0; t < length; t += kLanes) {
-    const std::int64_t n = length - t < kLanes ? length - t : kLanes;
+    const std::int64_t n = lanes_left(length, t);
     stage_obstacles(obstacles, clip, t, n, staged);
     const Mask<T> counts = first_lanes<T>(n);
     for (std::int64_t j = 0; j < args.shape.joints; ++j) {
       if (!obstacles.is_active[j]) continue;
       const T* at = a.data + clip * a.clip + t * a.frame + j * a.joint;
-      visit(t, n, j, collide_with_all(obstacles, staged, j, load_points(at, a.frame, a.coord, n), counts));
+      Collision<T> collision;
+      collide_with_all(obstacles, staged, j, load_points(at, a.frame, a.coord, n), counts, collision);
+      visit(t, n, j, collision);
     }
   }
 }

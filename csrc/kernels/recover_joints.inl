@@ -10,15 +10,14 @@ struct Roles {
 // Roles of sixteen consecutive outputs, the first of which is coordinate `phase`; lanes from `valid` on have none.
 template <class T>
 CONTROLMM_INLINE Roles<T> roles_from(std::int64_t phase, std::int64_t valid) {
-  using Int = typename IntOf<T>::type;
-  Int x[kLanes], z[kLanes], y_or_none[kLanes];
+  std::uint8_t x[kLanes], z[kLanes], y_or_none[kLanes];
   for (std::int64_t i = 0; i < kLanes; ++i) {
     const std::int64_t role = i < valid ? (phase + i) % 3 : 1;
-    x[i] = role == 0 ? -1 : 0;
-    z[i] = role == 2 ? -1 : 0;
-    y_or_none[i] = role == 1 ? -1 : 0;
+    x[i] = role == 0;
+    z[i] = role == 2;
+    y_or_none[i] = role == 1;
   }
-  return {load(x), load(z), load(y_or_none)};
+  return {load_mask<T>(x), load_mask<T>(z), load_mask<T>(y_or_none)};
 }
 
 // The blocks of sixteen that cover joints 1 .. J-1 of a frame.
@@ -76,6 +75,13 @@ void copy_row(const T* from, std::int64_t stride, std::int64_t n, T* to) {
   for (std::int64_t i = 0; i < n; ++i) to[i] = from[i * stride];
 }
 
+// Rows lie far apart in memory, and only their fronts are read: more than the processor's own prefetching sees through.
+constexpr std::int64_t kRowsAhead = 2;
+
+template <class T>
+CONTROLMM_INLINE void prefetch_row(const T* row, std::int64_t values) {
+  for (std::int64_t i = 0; i < values; i += kLanes) __builtin_prefetch(row + i);
+}
 template <class T>
 void recover_clip(const RecoverArgs<T>& args, std::int64_t clip, const FrameBlocks<T>& blocks, Scratch<T>& scratch) {
   const MotionShape& shape = args.shape;
@@ -98,6 +104,7 @@ void recover_clip(const RecoverArgs<T>& args, std::int64_t clip, const FrameBloc
       in = scratch.rows[0];
     }
     T* target = writes_in_place && !is_last ? out : scratch.rows[1];
+    if (reads_in_place) prefetch_row(in + kRowsAhead * f.frame, channels);
     rotate_frame(in, target, static_cast<T>(h.cos[t]), static_cast<T>(h.sin[t]), static_cast<T>(h.x[t]),
                  static_cast<T>(h.z[t]), blocks);
     if (target != out) copy_row(target, 1, values, out);
@@ -135,21 +142,16 @@ CONTROLMM_INLINE void rotate_frame_backward(const T* in, const T* g, T* out, T c
   root.yaw[t] = static_cast<double>(sum(sum_yaw));
 }
 
-// Channels that carry nothing into the joints, walked along whichever axis is contiguous.
+// Channels that carry nothing into the joints, where a frame is not one run of memory.
 template <class T>
 void zero_channels(const Strided3<T>& grad, T* clip, const MotionShape& shape, std::int64_t first) {
-  const bool is_frame_major = grad.channel == 1;
-  const std::int64_t rows = is_frame_major ? shape.frames : shape.dim - first;
-  const std::int64_t length = is_frame_major ? shape.dim - first : shape.frames;
-  const std::int64_t row_stride = is_frame_major ? grad.frame : grad.channel;
-  const std::int64_t stride = is_frame_major ? grad.channel : grad.frame;
-  T* start = clip + first * grad.channel;
-  for (std::int64_t row = 0; row < rows; ++row, start += row_stride) {
-    if (stride == 1) {
-      __builtin_memset(start, 0, static_cast<std::size_t>(length) * sizeof(T));
+  for (std::int64_t c = first; c < shape.dim; ++c) {
+    T* channel = clip + c * grad.channel;
+    if (grad.frame == 1) {
+      __builtin_memset(channel, 0, static_cast<std::size_t>(shape.frames) * sizeof(T));
       continue;
     }
-    for (std::int64_t i = 0; i < length; ++i) start[i * stride] = 0;
+    for (std::int64_t t = 0; t < shape.frames; ++t) channel[t * grad.frame] = 0;
   }
 }
 
@@ -183,12 +185,15 @@ void recover_clip_backward(const RecoverBackwardArgs<T>& args, std::int64_t clip
       own = scratch.rows[1];
     }
     T* target = writes_in_place ? out : scratch.rows[2];
+    if (reads_in_place) prefetch_row(in + kRowsAhead * f.frame, channels);
+    if (d.channel == 1) prefetch_row(out + kRowsAhead * d.frame, shape.dim);
     rotate_frame_backward(in, own, target, static_cast<T>(scratch.heading.cos[t]),
                           static_cast<T>(scratch.heading.sin[t]), blocks, scratch.gradient, t);
     if (target != out)
       for (std::int64_t c = 3; c < channels; ++c) out[c * d.channel] = target[c];
+    if (d.channel == 1) __builtin_memset(out + channels, 0, static_cast<std::size_t>(shape.dim - channels) * sizeof(T));
   }
-  zero_channels(d, grad, shape, channels);
+  if (d.channel != 1) zero_channels(d, grad, shape, channels);
   heading_backward(features, f.frame, f.channel, shape.frames, kDenormalised, scratch.heading, scratch.gradient, grad,
                    d.frame, d.channel);
 }

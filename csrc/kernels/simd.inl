@@ -49,9 +49,6 @@ struct Lanes {
 };
 
 template <class T>
-using Mask = Lanes<typename IntOf<T>::type>;
-
-template <class T>
 using Parts = std::make_index_sequence<static_cast<std::size_t>(Lanes<T>::kParts)>;
 
 // Pack expansion rather than a loop: the optimiser then keeps every part in a register.
@@ -76,21 +73,9 @@ CONTROLMM_LANE_OPERATOR(/)
 CONTROLMM_LANE_OPERATOR(&)
 CONTROLMM_LANE_OPERATOR(|)
 CONTROLMM_LANE_OPERATOR(^)
+CONTROLMM_LANE_OPERATOR(<<)
 CONTROLMM_LANE_OPERATOR(>>)
 #undef CONTROLMM_LANE_OPERATOR
-
-#define CONTROLMM_LANE_COMPARISON(op)                                                                                  \
-  template <class T>                                                                                                   \
-  CONTROLMM_INLINE Mask<T> operator op(const Lanes<T>& a, const Lanes<T>& b) {                                         \
-    return map_parts<typename IntOf<T>::type>([](auto x, auto y) __attribute__((always_inline)) { return x op y; }, a, \
-                                              b, Parts<T>{});                                                          \
-  }
-CONTROLMM_LANE_COMPARISON(<)
-CONTROLMM_LANE_COMPARISON(>)
-CONTROLMM_LANE_COMPARISON(<=)
-CONTROLMM_LANE_COMPARISON(>=)
-CONTROLMM_LANE_COMPARISON(==)
-#undef CONTROLMM_LANE_COMPARISON
 
 template <class T, std::size_t... I>
 CONTROLMM_INLINE Lanes<T> broadcast_parts(T value, std::index_sequence<I...>) {
@@ -125,46 +110,6 @@ CONTROLMM_INLINE void store_parts(T* p, const Lanes<T>& a, std::index_sequence<I
 template <class T>
 CONTROLMM_INLINE void store(T* p, const Lanes<T>& a) {
   store_parts(p, a, Parts<T>{});
-}
-
-// `n` lanes spaced by `stride`; the others are unspecified but harmless. Never touches memory past the n-th.
-template <class T>
-CONTROLMM_INLINE Lanes<T> load_strided(const T* p, std::int64_t stride, std::int64_t n) {
-  if (stride == 1 && n == kLanes) return load(p);
-  if (stride == 0) return broadcast(*p);
-  T buffer[kLanes] = {};
-  for (std::int64_t i = 0; i < n; ++i) buffer[i] = p[i * stride];
-  return load(buffer);
-}
-template <class T>
-CONTROLMM_INLINE void store_strided(T* p, std::int64_t stride, std::int64_t n, const Lanes<T>& a) {
-  if (stride == 1 && n == kLanes) return store(p, a);
-  T buffer[kLanes];
-  store(buffer, a);
-  for (std::int64_t i = 0; i < n; ++i) p[i * stride] = buffer[i];
-}
-
-template <class T, std::size_t... I>
-CONTROLMM_INLINE Lanes<T> select_parts(const Mask<T>& m, const Lanes<T>& a, const Lanes<T>& b,
-                                       std::index_sequence<I...>) {
-  return {{(m.part[I] ? a.part[I] : b.part[I])...}};
-}
-// Takes `a` where the mask is set. Unlike a product with 0 or 1 this keeps NaN where it is.
-template <class T>
-CONTROLMM_INLINE Lanes<T> select(const Mask<T>& m, const Lanes<T>& a, const Lanes<T>& b) {
-  return select_parts(m, a, b, Parts<T>{});
-}
-template <class T>
-CONTROLMM_INLINE Lanes<T> min(const Lanes<T>& a, const Lanes<T>& b) {
-  return select(a < b, a, b);
-}
-template <class T>
-CONTROLMM_INLINE Lanes<T> max(const Lanes<T>& a, const Lanes<T>& b) {
-  return select(a > b, a, b);
-}
-template <class T>
-CONTROLMM_INLINE Lanes<T> abs(const Lanes<T>& a) {
-  return select(a < zeros<T>(), zeros<T>() - a, a);
 }
 
 CONTROLMM_INLINE RegisterOf<float>::type sqrt_register(RegisterOf<float>::type a) {
@@ -220,32 +165,19 @@ CONTROLMM_INLINE T sum(const Lanes<T>& a) {
   }
 }
 
-CONTROLMM_INLINE int sign_bits(RegisterOf<std::int32_t>::type m) {
-#if defined(__AVX512F__)
-  return _mm512_movepi32_mask(reinterpret_cast<__m512i>(m));
-#elif defined(__AVX2__)
-  return _mm256_movemask_ps(reinterpret_cast<__m256>(m));
-#elif defined(__SSE2__)
-  return _mm_movemask_ps(reinterpret_cast<__m128>(m));
-#else
-  return vmaxvq_u32(reinterpret_cast<uint32x4_t>(m)) != 0;
-#endif
+template <class To, class From>
+CONTROLMM_INLINE Lanes<To> bits_of(const Lanes<From>& a) {
+  Lanes<To> b;
+  static_assert(sizeof a == sizeof b);
+  __builtin_memcpy(&b, &a, sizeof b);
+  return b;
 }
-CONTROLMM_INLINE int sign_bits(RegisterOf<std::int64_t>::type m) {
-  return sign_bits(reinterpret_cast<RegisterOf<std::int32_t>::type>(m));
-}
-template <class I, std::size_t... P>
-CONTROLMM_INLINE bool any_part(const Lanes<I>& m, std::index_sequence<P...>) {
-  return (sign_bits(m.part[P]) | ...) != 0;
-}
-// Whether a mask (all bits of a lane alike) has any lane set.
-template <class I>
-CONTROLMM_INLINE bool any(const Lanes<I>& m) {
-  return any_part(m, Parts<I>{});
-}
-template <class I>
-CONTROLMM_INLINE Lanes<I> negated(const Lanes<I>& m) {
-  return m ^ broadcast(I{-1});
+
+template <class To, class From>
+CONTROLMM_INLINE Lanes<To> converted(const Lanes<From>& a) {
+  using Reg = typename Lanes<To>::Reg;
+  return map_parts<To>([](auto x) __attribute__((always_inline)) { return __builtin_convertvector(x, Reg); }, a,
+                       Parts<From>{});
 }
 
 CONTROLMM_INLINE Lanes<double> to_double(const Lanes<double>& a) { return a; }
@@ -258,12 +190,14 @@ CONTROLMM_INLINE Lanes<double> to_double(const Lanes<float>& a) {
 }
 
 template <class T>
-CONTROLMM_INLINE Lanes<T> load_narrowed(const double* p) {
+CONTROLMM_INLINE Lanes<T> narrowed(const Lanes<double>& a) {
   if constexpr (sizeof(T) == 8) {
-    return load(p);
+    return a;
   } else {
+    double wide[kLanes];
     T narrow[kLanes];
-    for (int i = 0; i < kLanes; ++i) narrow[i] = static_cast<T>(p[i]);
+    store(wide, a);
+    for (int i = 0; i < kLanes; ++i) narrow[i] = static_cast<T>(wide[i]);
     return load(narrow);
   }
 }

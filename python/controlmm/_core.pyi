@@ -79,6 +79,18 @@ def guidance_value_and_grad(
     threads: int,
     /,
 ) -> None: ...
+def control_value_and_grad(
+    decoded: _Array,
+    mean: _Array,
+    std: _Array,
+    targets: _Array,
+    mask: _Array,
+    norm: int,
+    loss: _Array,
+    gradient: _Array,
+    threads: int,
+    /,
+) -> None: ...
 def gumbel_noise(seed: int, first_clip: int, noise: _Array, threads: int, /) -> None: ...
 def gumbel_straight_through(
     logits: _Array,

@@ -71,6 +71,26 @@ void fused_gradient_matches_central_differences() {
   }
 }
 
+void control_alone_is_guidance_without_obstacles() {
+  Problem problem;
+  std::vector<double> with(problem.decoded.size()), without(problem.decoded.size()), loss(kClips), alone(kClips);
+  const auto decoded = row_major(problem.decoded.data(), {kClips, kDim, kFrames});
+  const auto mean = row_major(problem.mean.data(), {kDim}), std = row_major(problem.std.data(), {kDim});
+  const auto targets = row_major(problem.targets.data(), {kClips, kFrames, kJoints, 3});
+  const auto mask = row_major(problem.mask.get(), {kClips, kFrames, kJoints, 3});
+  controlmm::Obstacles none = problem.scene.obstacles();
+  none.kinds.shape[0] = none.parameters.shape[1] = 0;
+  controlmm::guidance_value_and_grad(decoded, mean, std, targets, mask, controlmm::Norm::l2, none,
+                                     problem.scene.clearance(), 0.5, row_major(loss.data(), {kClips}),
+                                     row_major(with.data(), {kClips, kDim, kFrames}));
+  controlmm::guidance_value_and_grad(decoded, mean, std, targets, mask, controlmm::Norm::l2,
+                                     row_major(alone.data(), {kClips}),
+                                     row_major(without.data(), {kClips, kDim, kFrames}));
+  CHECK(loss == alone);
+  CHECK(with == without);
+  CHECK(loss[0] > 0);
+}
+
 void consistency_averages_distances() {
   const float joints[2][3] = {{0, 0, 0}, {1, 1, 1}}, targets[2][3] = {{3, 4, 0}, {1, 1, 3}};
   const bool mask[2][3] = {{true, true, true}, {true, true, true}};
@@ -96,6 +116,7 @@ int main() {
   for (const std::string& isa : controlmm::available_isas()) {
     controlmm::set_isa(isa);
     fused_gradient_matches_central_differences();
+    control_alone_is_guidance_without_obstacles();
     consistency_averages_distances();
     noise_depends_on_its_place_only();
   }

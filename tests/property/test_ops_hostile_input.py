@@ -95,6 +95,7 @@ ARGUMENTS = {
     "obstacle_loss": (8, lambda t: (*t[:7], 0.1, True, t[7], 1)),
     "obstacle_loss_backward": (9, lambda t: (*t[:7], 0.1, True, *t[7:], 1)),
     "guidance_value_and_grad": (13, lambda t: (*t[:5], 0, *t[5:11], 0.1, True, 1.0, *t[11:], 1)),
+    "control_value_and_grad": (7, lambda t: (*t[:5], 0, *t[5:], 1)),
     "gumbel_noise": (1, lambda t: (1, 2, *t, 1)),
     "gumbel_straight_through": (5, lambda t: (*t[:2], 1.0, 3, 4, *t[2:], 1)),
     "softmax_backward": (2, lambda t: (t[0], 1.0, t[1], 1)),

@@ -100,6 +100,11 @@ void guidance_value_and_grad(const TensorView& decoded, const TensorView& mean, 
                              const Clearance& clearance, double obstacle_weight, const TensorView& loss,
                              const TensorView& gradient, int threads = 1);
 
+/// Same without obstacles.
+void guidance_value_and_grad(const TensorView& decoded, const TensorView& mean, const TensorView& std,
+                             const TensorView& targets, const TensorView& mask, Norm norm, const TensorView& loss,
+                             const TensorView& gradient, int threads = 1);
+
 /// Place of a draw in the noise: a function of these and the position only, so that threads and batch splits agree.
 struct NoiseSource {
   std::uint64_t seed = 0;

@@ -118,6 +118,11 @@ def guidance_native(
 ) -> Float[Tensor, "B"]:
     """The kernel alone: writes ``gradient`` and returns the loss."""
     loss = decoded.new_empty(decoded.shape[0])
+    if obstacle_arguments[0].shape[0] == 0:
+        core().control_value_and_grad(
+            decoded, mean, std, targets, mask, NORM_CODES[norm], loss, gradient, torch.get_num_threads()
+        )
+        return loss
     core().guidance_value_and_grad(
         decoded, mean, std, targets, mask, NORM_CODES[norm], *obstacle_arguments, margin, is_mean,
         obstacle_weight, loss, gradient, torch.get_num_threads(),
