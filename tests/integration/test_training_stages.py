@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 import torch
 from safetensors.torch import load_file
@@ -13,6 +15,7 @@ from controlmm.models.residual_transformer import ResidualTransformer
 from controlmm.motion.normalizer import Normalizer
 from controlmm.pipelines import ControlMM
 from controlmm.text.hashing import HashingTextEncoder
+from controlmm.training import rvq
 from controlmm.training.registry import MODULES, load_stage
 from controlmm.training.run_folder import RunFolder
 from controlmm.training.stage import load_tokenizer
@@ -129,6 +132,34 @@ def test_a_killed_and_resumed_stage_equals_the_unbroken_one_bit_by_bit(
 def test_a_stage_needs_the_ones_before_it(tiny_data_folder, tmp_path):
     with pytest.raises(FileNotFoundError, match=r"rvq holds no trained stage\. Run `controlmm train rvq`"):
         train("masked", tiny_data_folder, tmp_path)
+
+
+def test_augmented_clips_are_trained_on_and_written_down(trained, tiny_data_folder, tmp_path, monkeypatch):
+    """The made clips reach the sampler; statistics, hashes and the clip list stay those of the recordings."""
+    seen = []
+    windows = rvq.WindowSampler
+
+    def watched(clips, *arguments, **options):
+        seen.extend(clip.id for clip in clips)
+        return windows(clips, *arguments, **options)
+
+    monkeypatch.setattr(rvq, "WindowSampler", watched)
+    train_stage(
+        "rvq",
+        data=tiny_data_folder,
+        size="tiny",
+        root=tmp_path,
+        changes={"steps": 1},
+        options={"joined_share": "0.5", "bent_share": "0.5"},
+        progress=False,
+    )
+    assert len([name for name in seen if "+" in name and "@" not in name]) == 3
+    assert len([name for name in seen if "@" in name]) == 3
+    told, plain = (json.loads((root / "rvq" / "run.json").read_text()) for root in (tmp_path, trained))
+    assert told["options"] == {"joined_share": "0.5", "bent_share": "0.5"}
+    assert told["data"] == plain["data"]
+    for name in ("normalizer.safetensors", "rvq/clips.tsv"):
+        assert (tmp_path / name).read_bytes() == (trained / name).read_bytes()
 
 
 def test_other_data_is_not_mixed_into_a_run(trained, tiny_data_folder, walk, tmp_path):

@@ -18,6 +18,7 @@ from controlmm.models.rvq_vae import RvqVae
 from controlmm.models.tokenizer import MotionTokenizer
 from controlmm.motion.normalizer import ROOT_CONTACT_BIAS, Normalizer
 from controlmm.text import TextEncoder, encode_all
+from controlmm.training.augmentation import Augmentation, augmented
 from controlmm.training.recipe import Recipe, Sample
 from controlmm.training.settings import TrainingSettings
 from controlmm.training.tokens import MIN_FRAMES, TokenSampler
@@ -35,13 +36,19 @@ class StageInputs:
     folder: MotionFolder
     text_encoder: TextEncoder | None = None  # set for stages that use text
     options: Any = None  # the stage's own, see `Stage.options`
+    augmentation: Augmentation = field(default_factory=Augmentation)
     progress: bool = True
     writes: bool = True  # whether this process may write into the root; one of those that train together may
 
     @cached_property
-    def train_clips(self) -> list[FeatureClip]:
-        """The clips of the training split."""
+    def recorded_clips(self) -> list[FeatureClip]:
+        """The clips of the training split as they were recorded."""
         return list(self.folder.clips("train", progress=self.progress))
+
+    @cached_property
+    def train_clips(self) -> list[FeatureClip]:
+        """What to train on: the recorded clips, and those that augmentation makes of them."""
+        return self.recorded_clips + augmented(self.recorded_clips, self.augmentation)
 
     @cached_property
     def val_clips(self) -> list[FeatureClip]:
@@ -50,8 +57,8 @@ class StageInputs:
 
     @property
     def splits(self) -> dict[str, list[FeatureClip]]:
-        """Both, by name."""
-        return {"train": self.train_clips, "val": self.val_clips}
+        """The recorded clips of both, by name."""
+        return {"train": self.recorded_clips, "val": self.val_clips}
 
     def text_features(self) -> dict[str, Float[Tensor, "E"]]:
         """The text encoder's pooled vector of every caption; cached beside the data."""
@@ -120,10 +127,10 @@ def fit_normalizer(inputs: StageInputs, *, root_contact_bias: float = ROOT_CONTA
     Raises:
         ValueError: If the training split is empty.
     """
-    if not inputs.train_clips:
+    if not inputs.recorded_clips:
         raise ValueError("The training split has no readable clip.")
     normalizer = Normalizer.fit(
-        (clip.features for clip in inputs.train_clips), root_contact_bias=root_contact_bias
+        (clip.features for clip in inputs.recorded_clips), root_contact_bias=root_contact_bias
     )
     if inputs.writes:
         inputs.root.mkdir(parents=True, exist_ok=True)

@@ -12,6 +12,7 @@ import torch
 from controlmm.data.folder import MotionFolder
 from controlmm.nn.checkpoint import CONFIG_FILE, WEIGHTS_FILE, read_config
 from controlmm.text import TextEncoder
+from controlmm.training.augmentation import Augmentation
 from controlmm.training.changes import with_changes
 from controlmm.training.loop import train
 from controlmm.training.processes import Processes
@@ -57,8 +58,9 @@ def train_stage(
         root: Folder of all stages of one model.
         text_encoder: Needed by stages that use text; its features are cached beside the data.
         changes: Fields of :class:`TrainingSettings` to override.
-        options: Fields to change of the network's configuration, of the stage's own options or of its
-            settings, written as on the command line: ``{"masks": "cross"}``.
+        options: Fields to change of the network's configuration, of the stage's own options, of its settings
+            or of :class:`controlmm.training.augmentation.Augmentation`, written as on the command line:
+            ``{"masks": "cross", "joined_share": "0.5"}``.
         start_from: Train given weights further: a network's folder, or the folder of a whole model, which
             also lends the earlier stages that ``root`` lacks (they are copied there). The network keeps its
             configuration; ``size`` then only names the settings.
@@ -80,13 +82,15 @@ def train_stage(
     if start_from is not None:
         start = starting_folder(Path(start_from), stage)
         config = read_config(start / CONFIG_FILE, type(config))
-    parts = with_changes({"config": config, "options": stage.options, "settings": settings}, options or {})
+    parts = {"config": config, "options": stage.options, "settings": settings, "data": Augmentation()}
+    parts = with_changes(parts, options or {})
     settings = parts["settings"]
     inputs = StageInputs(
         root,
         MotionFolder(data),
         text_encoder=text_encoder,
         options=parts["options"],
+        augmentation=parts["data"],
         progress=progress,
         writes=team.is_first,
     )
