@@ -29,7 +29,7 @@ TABLES = {
     "table2": (2, []),
     "table3": (8, []),
     "table4": (5, ["table4.png"]),
-    "table5": (3, ["figure2.png"]),
+    "table5": (6, ["figure2.png"]),
     "table7": (9, []),
     "table8": (6, ["table8.png"]),
     "table9": (6, ["table9.png"]),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -13,7 +13,6 @@ from controlmm.evaluation.motion_sources import Generated, RealMotion
 from controlmm.evaluation.protocol import Row
 from controlmm.evaluation.reproduction import Line, Reproduction
 from controlmm.evaluation.scores import RowScores
-from controlmm.generation.editing import EditingBudget
 from controlmm.models.control_branch import ControlBranch
 from controlmm.pipelines.controlmm import ControlMM
 from controlmm.pipelines.presets import PRESETS, Preset
@@ -35,7 +34,7 @@ class Study:
     Attributes:
         pipeline: The model.
         effort: Share of the papers' editing iterations, for a quick look; 1 takes all.
-        presets: Presets of ours that get rows beside the paper's.
+        presets: Presets of ours that get lines beside the paper's, in the tables where that makes sense.
     """
 
     pipeline: ControlMM
@@ -48,10 +47,13 @@ class Study:
 
     def paper_preset(self, *, logits: int, codebook: int, steps: int = 10) -> Preset:
         """The paper's editing with these iteration counts, times ``effort``."""
-        budget = EditingBudget(
-            logits_iterations=round(self.effort * logits), latent_iterations=round(self.effort * codebook)
+        accurate = PRESETS["paper-accurate"]
+        budget = replace(
+            accurate.budget,
+            logits_iterations=round(self.effort * logits),
+            latent_iterations=round(self.effort * codebook),
         )
-        return Preset(budget, steps=steps)
+        return replace(accurate, budget=budget, steps=steps)
 
     @property
     def fast(self) -> Preset:
@@ -146,7 +148,9 @@ def table4(study: Study) -> Reproduction:
 
 
 def table5(study: Study) -> Reproduction:
-    """Seconds against quality and error."""
+    """Seconds against quality and error; presets of ours too, all if none is named."""
+    own = study.presets or [name for name in PRESETS if not name.startswith("paper-")]
+    study = replace(study, presets=tuple(own))
     papers = {"Fast": study.fast, "Medium": study.medium, "Accurate": study.accurate}
     lines = [study.line((f"ControlMM-{name}",), preset) for name, preset in papers.items()]
     return Reproduction("table5", [*lines, *study.own(lambda name: (f"preset {name}",))])
