@@ -43,6 +43,23 @@ def test_the_same_command_computes_nothing_again(
     assert {file: file.stat().st_mtime_ns for file in (tmp_path / "out").rglob("*.safetensors")} == files
 
 
+def test_both_systems_are_measured_on_the_same_clips_and_targets(
+    command: Callable[..., str], arguments: list[object], tiny_tlcontrol_folder: Path, tmp_path: Path
+) -> None:
+    printed = command(*arguments, "--model", tiny_tlcontrol_folder, "--control", "cross", "--preset", "fast")
+    rows = json.loads((tmp_path / "out" / "results.json").read_text())["rows"]
+    labels = [row["label"] for row in rows]
+    assert labels == [
+        "real motion",
+        "pipeline, reconstruction",
+        "pipeline, fast",
+        "tlcontrol, reconstruction",
+        "tlcontrol, fast",
+    ]
+    assert len({row["metrics"]["keys"]["mean"] for row in rows}) == 1
+    assert "| tlcontrol, perplexity of " in printed
+
+
 def test_two_models_need_two_names(
     refused: Callable[..., str], arguments: list[object], tiny_pipeline_folder: Path
 ) -> None:
