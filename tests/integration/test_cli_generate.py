@@ -13,7 +13,15 @@ import pytest
 import torch
 
 from controlmm.cli.generate import slug
-from controlmm.controls import Avoid, ControlFile, PathControl, Sphere, penetration, save_controls
+from controlmm.controls import (
+    Avoid,
+    ControlFile,
+    PathControl,
+    Sphere,
+    TimelineEntry,
+    penetration,
+    save_controls,
+)
 from controlmm.evaluation import foot_skating_ratio
 from controlmm.motion.motion import Motion
 
@@ -224,3 +232,82 @@ def test_a_dense_array_sets_the_length(command: Command, tiny_pipeline_folder: P
 
 def _matches(pattern: str, message: str) -> bool:
     return re.search(pattern, message) is not None
+
+
+def test_a_timeline_file_is_generated_pass_by_pass(
+    command: Command, tiny_pipeline_folder: Path, tmp_path: Path
+) -> None:
+    entries = [
+        TimelineEntry("lower", "a person walks", frames=(0, FRAMES)),
+        TimelineEntry("right_arm", "a person waves", frames=(0, FRAMES)),
+    ]
+    printed = command(
+        "generate", "--timeline", save_controls(ControlFile(timeline=entries), tmp_path / "timeline.json"),
+        "--preset", "fast", "--formats", "npz,png", "--out", tmp_path / "out",
+        "--model", tiny_pipeline_folder,
+    )  # fmt: skip
+    motion = Motion.load(tmp_path / "out" / "a-person-walks_0_0.npz")
+    assert motion.extra["timeline"] == tuple(entries)
+    assert motion.num_frames == FRAMES
+    assert float(printed.splitlines()[2].split()[1]) > 0  # how well the second pass held the first
+
+
+def test_a_motion_is_edited(command: Command, tiny_pipeline_folder: Path, tmp_path: Path) -> None:
+    model = ("--model", tiny_pipeline_folder, "--preset", "fast")
+    first = command(
+        "generate", PROMPT, "--seconds", 2, "--formats", "npz,bvh", "--out", tmp_path, "--quiet", *model
+    ).split()
+    for source, keep in (
+        (first[0], ("--keep", "0-0.6", "--keep", "1.2-2")),
+        (first[1], ("--keep-part", "lower")),
+    ):
+        printed = command(
+            "generate",
+            "a person jumps",
+            "--edit",
+            source,
+            *keep,
+            "--formats",
+            "npz",
+            "--out",
+            tmp_path / "e",
+            *model,
+        )
+        edited = Motion.load(tmp_path / "e" / "a-person-jumps_0_0.npz")
+        assert edited.num_frames == 40
+        assert edited.text == "a person jumps"
+        assert float(printed.splitlines()[2].split()[1]) > 0
+    assert "jumps" in command(
+        "generate", "he jumps", "--edit", first[0], "--loose", "--out", tmp_path / "f", *model
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--keep", "0-1"), "`--keep` says what of a motion to keep. Name the motion with `--edit FILE`."),
+        (("--loose",), "`--loose` says what of a motion to keep."),
+        (
+            ("--edit", "a.npz", "--seconds", "2"),
+            "`--edit` and `--seconds` do not go together. Leave one out.",
+        ),
+        (("--edit", "a.npz", "--controls", "line.json"), "`--edit` and `--controls` do not go together."),
+        (
+            ("--edit", "a.npz", "--keep", "1"),
+            "`--keep` must be START-END in seconds, such as 0-2.5, got '1'.",
+        ),
+        (("--edit", "a.npz", "--timeline", "t.json"), "`--timeline` and `--edit` do not go together."),
+        (("--timeline", "t.json"), "A timeline has prompts of its own. Leave the prompt out."),
+        (("--timeline", "line.json"), 'line.json holds no timeline. Give it as "timeline": [...]'),
+        (("--timeline", "t.json", "--seconds", "2"), "`--timeline` and `--seconds` do not go together."),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(
+    refused: Command, walk_line: Path, walking_joints: torch.Tensor, arguments: tuple[str, ...], said: str
+) -> None:
+    folder = walk_line.parent
+    Motion(walking_joints).save(folder / "a.npz")
+    entry = TimelineEntry("body", "a person walks", frames=(0, FRAMES))
+    save_controls(ControlFile(timeline=[entry]), folder / "t.json")
+    files = {path.name: str(path) for path in folder.iterdir()}
+    assert said in refused("generate", PROMPT, *(files.get(argument, argument) for argument in arguments))

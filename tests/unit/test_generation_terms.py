@@ -17,7 +17,8 @@ LENGTHS = torch.tensor([8, 6])
 
 def terms_of(obstacles, **options):
     arguments = {
-        "lengths": LENGTHS.tolist(),
+        "lengths": LENGTHS,
+        "frames": 8,
         "skeleton": HUMANML3D,
         "origin": ORIGIN,
         "padded": 8,
@@ -102,7 +103,7 @@ def test_the_gradient_of_an_objective_with_terms_is_that_of_its_value(tiny_pipel
     mask[:, 9, 21] = has_targets
     lengths = torch.tensor([16, 16])
     terms = [
-        *terms_of([Avoid(Sphere((1, 0.9, -2), 2.0))], lengths=[16, 16], padded=16),
+        *terms_of([Avoid(Sphere((1, 0.9, -2), 2.0))], lengths=lengths, frames=16, padded=16),
         ObjectiveTerm(Objective(lambda j: j[:, -1].square().sum((1, 2))), True, lengths, ORIGIN),
     ]
     objective = ControlObjective(decoder, torch.zeros(2, 16, 22, 3), mask, frames, terms=terms)

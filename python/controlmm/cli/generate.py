@@ -40,6 +40,21 @@ def generate(
         Path | None,
         typer.Option(help="JSON file with obstacles to keep clear of, beside those in the control file."),
     ] = None,
+    timeline: Annotated[
+        Path | None, typer.Option(help="JSON file that says what each body part does when.")
+    ] = None,
+    edit: Annotated[
+        Path | None, typer.Option(help="Motion to change: .npz, .npy or .bvh; see --keep and --keep-part.")
+    ] = None,
+    keep: Annotated[
+        list[str] | None, typer.Option(help="START-END in seconds of the motion that stays; may be repeated.")
+    ] = None,
+    keep_part: Annotated[
+        list[str] | None, typer.Option(help="Body part that stays, such as lower; may be repeated.")
+    ] = None,
+    loose: Annotated[
+        bool, typer.Option("--loose", help="Keep tokens only: kept poses may shift on the ground.")
+    ] = False,
     preset: Annotated[
         str, typer.Option(help="fast, balanced or accurate; with paper- in front as in the papers.")
     ] = "balanced",
@@ -64,34 +79,47 @@ def generate(
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but the names of the files.")] = False,
 ) -> None:
     """Generate motions and print how well each of them meets its controls."""
-    from controlmm.cli.scene_options import all_obstacles
+    from controlmm.cli.scene_options import all_obstacles, check_together, parse_interval, timeline_entries
     from controlmm.controls import load_controls
+    from controlmm.motion.motion import Motion
 
     suffixes = _checked_formats(formats)
     document = load_controls(controls) if controls else None
-    prompt = _chosen_prompt(prompt, document)
-    seconds = _chosen_seconds(seconds, document, controls)
+    entries = timeline_entries(document, timeline)
+    check_together(
+        edit=edit, has_timeline=bool(entries), keep=keep, keep_part=keep_part, loose=loose, controls=controls,
+        obstacles=obstacles, seconds=seconds, vary=vary,
+    )  # fmt: skip
     avoided = all_obstacles(document, obstacles)
+    if entries and prompt is not None:
+        raise ValueError("A timeline has prompts of its own. Leave the prompt out.")
+    prompt = entries[0].prompt if entries else _chosen_prompt(prompt, document)
+    options: dict[str, Any] = {
+        "samples": samples, "preset": preset, "guidance_scale": guidance, "seed": seed
+    }  # fmt: skip
+    held = document.controls if document else ()
+    source = Motion.load(edit) if edit else None
+    seconds = None if entries else _chosen_seconds(seconds, document, controls)
+    intervals = [parse_interval(text) for text in keep or ()]
 
-    from controlmm.pipelines import TLControl, load_pipeline
+    from controlmm.pipelines import ControlMM, TLControl, load_pipeline
 
     pipeline = load_pipeline(model)
+    if source is not None and not isinstance(pipeline, ControlMM):
+        raise ValueError("`--edit` needs a ControlMM model; TLControl predicts all codes from its controls.")
     if vary is not None and not isinstance(pipeline, TLControl):
         raise ValueError("`--vary` needs a TLControl model, for example: --model tlcontrol.")
     parts: dict[str, Any] = {} if vary is None else {"vary": vary}
     with PhaseBars(enabled=not quiet) as bars:
-        result = pipeline(
-            prompt,
-            seconds=seconds,
-            controls=document.controls if document else (),
-            obstacles=avoided,
-            samples=samples,
-            preset=preset,
-            guidance_scale=guidance,
-            seed=seed,
-            progress=bars,
-            **parts,
-        )
+        options |= {"progress": bars, **parts}
+        if entries:
+            result = pipeline.timeline(entries, controls=held, obstacles=avoided, **options)
+        elif source is not None and isinstance(pipeline, ControlMM):
+            result = pipeline.edit(
+                source, prompt, keep=intervals, keep_parts=keep_part or (), exact=not loose, **options
+            )
+        else:
+            result = pipeline(prompt, seconds=seconds, controls=held, obstacles=avoided, **options)
     stem = f"{slug(prompt)}_{seed}"
     files = [
         motion.save(out / f"{stem}_{index}.{suffix}")
@@ -160,7 +188,8 @@ def _report(result: GenerationResult, *, has_bvh: bool) -> str:
     skating = foot_skating_ratio(torch.stack([motion.joints for motion in result]), skeleton=skeleton)
     rows = []
     for index, motion in enumerate(result):
-        has_targets, has_obstacles = "targets" in motion.extra, "obstacles" in motion.extra
+        has_targets = "targets" in motion.extra or result.control_error[index] > 0
+        has_obstacles = "obstacles" in motion.extra
         error = f"{100 * result.control_error[index].item() / unit:.2f}" if has_targets else "-"
         depth = f"{100 * result.penetration[index].item():.2f}" if has_obstacles else "-"
         fit = f"{1000 * fit_rotations(motion.joints, skeleton).mean_error / unit:.1f}" if has_bvh else "-"

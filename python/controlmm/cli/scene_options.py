@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from controlmm.controls import Avoid, ControlFile
+    from controlmm.controls import Avoid, ControlFile, TimelineEntry
 
 
 def all_obstacles(document: ControlFile | None, path: Path | None) -> tuple[Avoid, ...]:
@@ -27,3 +27,63 @@ def all_obstacles(document: ControlFile | None, path: Path | None) -> tuple[Avoi
             f'{path} holds no obstacles. Give them as "obstacles": [...], see docs/obstacles.md.'
         )
     return avoided + as_avoids(scene.obstacles)
+
+
+def timeline_entries(document: ControlFile | None, path: Path | None) -> tuple[TimelineEntry, ...]:
+    """The timeline of its own file, else of the control file; empty without either.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If the file is broken or holds no timeline.
+    """
+    from controlmm.controls import load_controls
+
+    if path is None:
+        return tuple(document.timeline) if document else ()
+    entries = tuple(load_controls(path).timeline)
+    if not entries:
+        raise ValueError(f'{path} holds no timeline. Give it as "timeline": [...], see docs/timeline.md.')
+    return entries
+
+
+def parse_interval(text: str) -> tuple[float, float]:
+    """Start and end in seconds of an interval such as ``0-2.5``.
+
+    Raises:
+        ValueError: If it is none.
+    """
+    start, _, end = text.partition("-")
+    try:
+        return float(start), float(end)
+    except ValueError:
+        raise ValueError(f"`--keep` must be START-END in seconds, such as 0-2.5, got {text!r}.") from None
+
+
+def check_together(*, edit: Path | None, has_timeline: bool, **others: object) -> None:
+    """Refuse options that do not go together: nothing that was asked for is ignored.
+
+    Args:
+        edit: The motion to edit.
+        has_timeline: Whether there is a timeline.
+        others: Values of further options by their names; falsy: not given.
+
+    Raises:
+        ValueError: Naming two that do not go together.
+    """
+    given = {name.replace("_", "-") for name, value in others.items() if value}
+    if has_timeline and edit:
+        raise ValueError(
+            "`--timeline` and `--edit` do not go together. Edit what a timeline made in a second call."
+        )
+    for first, is_there, allowed in (
+        ("--edit", edit is not None, {"keep", "keep-part", "loose"}),
+        ("--timeline", has_timeline, {"controls", "obstacles"}),
+        ("--controls", edit is None and not has_timeline, {"controls", "obstacles", "seconds", "vary"}),
+    ):
+        if is_there and given - allowed:
+            name = sorted(given - allowed)[0]
+            if first == "--controls":
+                raise ValueError(
+                    f"`--{name}` says what of a motion to keep. Name the motion with `--edit FILE`."
+                )
+            raise ValueError(f"`{first}` and `--{name}` do not go together. Leave one out.")

@@ -23,7 +23,7 @@ from controlmm.models.masked_transformer import MaskedTransformer
 from controlmm.models.residual_transformer import ResidualTransformer
 from controlmm.models.tokenizer import MotionTokenizer
 
-_DECIDED = 1e5  # confidence of tokens that are never masked again
+DECIDED = 1e5  # confidence of tokens that are never masked again
 _RESIDUAL_TOP_SHARE = 0.1  # of the codes can be drawn in residual layers that are drawn
 
 
@@ -62,7 +62,7 @@ def decode_from_text(base: MaskedTransformer, request: DecodingRequest) -> Int[T
     """Base tokens of motions that follow a text only (MoMask's loop); -1 in padding."""
     valid = request.valid
     ids = torch.where(valid, base.mask_id, base.pad_id)
-    scores = torch.zeros(valid.shape).masked_fill(~valid, _DECIDED)
+    scores = torch.zeros(valid.shape).masked_fill(~valid, DECIDED)
     for step in range(request.steps):
         hidden = lowest(scores, masked_counts(request, step))
         ids = torch.where(hidden, base.mask_id, ids)
@@ -71,7 +71,7 @@ def decode_from_text(base: MaskedTransformer, request: DecodingRequest) -> Int[T
         drawn = (allowed + request.gumbel(logits.shape[-1])).argmax(-1)
         ids = torch.where(hidden, drawn, ids)
         confidence = logits.softmax(-1).gather(-1, drawn[..., None]).squeeze(-1)
-        scores = torch.where(hidden, confidence, _DECIDED)
+        scores = torch.where(hidden, confidence, DECIDED)
         request.report(step + 1, confidence)
     return torch.where(valid, ids, -1)
 
@@ -97,7 +97,7 @@ def decode_with_control(
     mask_embedding, mean_code = base.token_embedding.weight[base.mask_id], codes.mean(0)
     logits = torch.ones(*valid.shape, len(codes))
     embedded = mask_embedding.expand(*valid.shape, -1)
-    scores = torch.zeros(valid.shape).masked_fill(~valid, _DECIDED)
+    scores = torch.zeros(valid.shape).masked_fill(~valid, DECIDED)
     for step in range(request.steps):
         hidden = lowest(scores, masked_counts(request, step))[..., None]
         embedded = torch.where(hidden, mask_embedding, embedded)
@@ -124,7 +124,7 @@ def decode_with_control(
         second = request.gumbel(len(codes)) if rules.noise_twice else 0.0
         drawn = (weights.log() + second).argmax(-1)
         confidence = logits.softmax(-1).gather(-1, drawn[..., None]).squeeze(-1)
-        scores = torch.where(hidden[..., 0], confidence, _DECIDED)
+        scores = torch.where(hidden[..., 0], confidence, DECIDED)
         request.report(step + 1, confidence)
     return logits
 

@@ -125,20 +125,22 @@ class OnFloor:
 def obstacle_terms(
     obstacles: Sequence[Avoid],
     *,
-    lengths: Sequence[int],
+    lengths: Int[Tensor, "B"],
+    frames: int,
+    padded: int,
     skeleton: Skeleton,
     origin: Float[Tensor, "3"],
-    padded: int,
     weight: float = OBSTACLE_WEIGHT,
 ) -> tuple[ObstacleTerm, ...]:
     """One term for all obstacles that the same joints avoid by the same distance.
 
     Args:
         obstacles: In the caller's world, metres.
-        lengths: Frames of each clip; moving obstacles move over the longest, then stand still.
+        lengths: (B,) frames of each clip.
+        frames: Frames over which moving obstacles move; then they stand still.
+        padded: Frames of the padded batch; may be fewer.
         skeleton: Joints and unit.
         origin: (3,) where the networks' frame stands in the caller's world, in the skeleton's unit.
-        padded: Frames of the padded batch.
         weight: Factor of the terms.
 
     Raises:
@@ -153,14 +155,14 @@ def obstacle_terms(
         ObstacleTerm(
             pack_obstacles(
                 [
-                    spread(placed(avoid.over(max(lengths)), offset=-origin / unit, scale=unit), None, padded)
+                    spread(placed(avoid.over(frames), offset=-origin / unit, scale=unit), None, padded)
                     for avoid in avoids
                 ]
             ),
             skeleton,
             joints,
             radius,
-            torch.tensor(lengths),
+            lengths,
             weight,
         )
         for (joints, radius), avoids in groups.items()

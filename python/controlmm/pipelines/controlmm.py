@@ -31,10 +31,13 @@ from controlmm.models.length_estimator import LengthEstimator
 from controlmm.models.masked_transformer import MaskedTransformer
 from controlmm.models.residual_transformer import ResidualTransformer
 from controlmm.models.rvq_vae import RvqVae, frame_mask
+from controlmm.motion.motion import Motion
 from controlmm.motion.normalizer import Normalizer
 from controlmm.nn.checkpoint import PretrainedModel
 from controlmm.pipelines import folder as files
 from controlmm.pipelines.checks import check_masks_end, check_sizes
+from controlmm.pipelines.motion_editing import run_edit
+from controlmm.pipelines.output import GenerationResult
 from controlmm.pipelines.pipeline import MotionPipeline
 from controlmm.pipelines.presets import Preset, resolve_preset
 from controlmm.text import TextEncoder, check_same_encoder, load_text_encoder
@@ -128,6 +131,70 @@ class ControlMM(MotionPipeline[Preset]):
         return resolve_preset(preset, guidance_scale=guidance_scale)
 
     @torch.no_grad()
+    def edit(
+        self,
+        motion: Motion,
+        prompt: str,
+        *,
+        keep: Sequence[tuple[float, float]] = (),
+        keep_parts: Sequence[str] = (),
+        exact: bool = True,
+        samples: int = 1,
+        preset: str | Preset = "balanced",
+        guidance_scale: float | None = None,
+        seed: int = 0,
+        progress: Progress | None = None,
+    ) -> GenerationResult:
+        """Change a motion that exists: what is kept stays, the rest follows the prompt.
+
+        - ``keep``: whole poses stay in these intervals, the tokens outside are drawn anew (in-painting):
+          a new ending, beginning or middle.
+        - ``keep_parts``: these parts stay at all frames, under control: ``["lower"]`` (pelvis and feet) gives
+          the upper body a new task.
+        - neither: every decoding step draws the least certain 16 % of the tokens anew; the motion drifts
+          towards the prompt.
+
+        Args:
+            motion: What to change, at most 196 frames at 20 fps, anywhere in the world.
+            prompt: What the person does where nothing is kept.
+            keep: (start, end) in seconds; may be several.
+            keep_parts: Parts (see ``controlmm.controls.PARTS``) or joints.
+            exact: Move what was kept back onto the source after drawing: a kept ending is where it was.
+                ``False`` leaves it as the tokens decode: poses are kept to some centimetres, but the way
+                on the ground goes on from wherever the new part leads.
+            samples: As in a call.
+            preset: As in a call.
+            guidance_scale: As in a call.
+            seed: As in a call.
+            progress: As in a call.
+
+        Returns:
+            Motions in the world of ``motion``; ``control_error`` is the distance of what was kept.
+
+        Raises:
+            TypeError: If an argument has the wrong type; nothing has run then.
+            ValueError: If an argument is unusable, or everything is kept; nothing has run then.
+        """
+        return run_edit(
+            self,
+            motion,
+            prompt,
+            keep=keep,
+            keep_parts=keep_parts,
+            exact=exact,
+            samples=samples,
+            preset=resolve_preset(preset, guidance_scale=guidance_scale),
+            seed=seed,
+            progress=progress,
+        )
+
+    @property
+    def longest(self) -> int:
+        """See :class:`MotionPipeline`."""
+        tokens = min(self.transformer.config.max_tokens, self.residual.config.max_tokens)
+        return tokens * self.decoder.downsample
+
+    @torch.no_grad()
     def generate_latents(
         self,
         text: Float[Tensor, "B E"],
@@ -200,11 +267,11 @@ class ControlMM(MotionPipeline[Preset]):
         branch: ControlBranch | None,
         preset: Preset,
     ) -> Tensor:
-        keep = request.valid[..., None].float()
         if branch is None and not preset.budget.logits_iterations:
             latents = self._from_text(request, preset)
         else:
             latents = self._from_logits(request, objective, branch, preset)
+        keep = request.valid[..., None].float()
         return edit_latents(objective, latents, keep, preset.budget, progress=request.progress).latents
 
     def _from_logits(

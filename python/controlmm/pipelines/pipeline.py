@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from controlmm.controls import Avoid, Control, Objective, Obstacle
+from controlmm.controls import Avoid, Control, Objective, Obstacle, TimelineEntry
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.noise import clip_seeds
 from controlmm.generation.solvers import Progress
@@ -22,10 +22,12 @@ from controlmm.models.length_estimator import LengthEstimator
 from controlmm.motion.skeleton import Skeleton
 from controlmm.nn.checkpoint import PretrainedModel
 from controlmm.pipelines import folder as files
+from controlmm.pipelines.chaining import run_chain
 from controlmm.pipelines.checks import check_sampling
 from controlmm.pipelines.length import draw_frames
 from controlmm.pipelines.output import GenerationResult
 from controlmm.pipelines.scene import Scene
+from controlmm.pipelines.timeline import run_timeline
 from controlmm.text import TextEncoder, check_prompt
 
 MAX_FRAMES = 196
@@ -152,6 +154,106 @@ class MotionPipeline(ABC, Generic[_Plan]):
         """Frames that the networks work on for a motion of ``frames``: whole tokens."""
         step = self.decoder.downsample
         return -(-frames // step) * step
+
+    @torch.no_grad()
+    def timeline(
+        self,
+        entries: Sequence[TimelineEntry],
+        *,
+        controls: Sequence[Control] = (),
+        obstacles: Sequence[Obstacle | Avoid] = (),
+        samples: int = 1,
+        preset: str | _Plan = "balanced",
+        guidance_scale: float | None = None,
+        seed: int = 0,
+        hold_rest: bool = True,
+        progress: Progress | None = None,
+    ) -> GenerationResult:
+        """Generate motions in which body parts follow prompts of their own, each in its own time.
+
+        One pass an entry, in their order: each pass follows its entry's prompt and holds the parts of
+        earlier entries, in their intervals, where the pass before had them. So an entry decides its part in
+        its interval, and later entries what is left of the body then.
+
+        Args:
+            entries: Parts, prompts and intervals; may overlap. The motion ends with the last of them.
+            controls: As in a call, held in every pass.
+            obstacles: As in a call, avoided in every pass.
+            samples: As in a call.
+            preset: As in a call, for every pass.
+            guidance_scale: As in a call.
+            seed: As in a call.
+            hold_rest: Keep the whole body outside an entry's interval as the pass before had it, but for 5
+                frames of transition. ``False`` is the published way: each prompt acts on the whole clip.
+            progress: As in a call; every pass reports anew.
+
+        Returns:
+            The motions; ``control_error`` is how well the last pass held earlier entries and controls.
+
+        Raises:
+            TypeError: If an argument has the wrong type; nothing has run then.
+            ValueError: If an argument is unusable or the timeline is longer than the networks can make.
+        """
+        return run_timeline(
+            self,
+            entries,
+            controls=controls,
+            obstacles=obstacles,
+            samples=samples,
+            preset=self.resolve_preset(preset, guidance_scale),
+            seed=seed,
+            hold_rest=hold_rest,
+            progress=progress,
+        )
+
+    @torch.no_grad()
+    def chain(
+        self,
+        clips: Sequence[tuple[str, float]],
+        *,
+        overlap: float = 0.8,
+        samples: int = 1,
+        preset: str | _Plan = "balanced",
+        guidance_scale: float | None = None,
+        seed: int = 0,
+        progress: Progress | None = None,
+    ) -> GenerationResult:
+        """Generate motions of any length, clip after clip.
+
+        Each clip begins with the poses in which the one before ends, all joints controlled; over these frames
+        one fades into the other.
+
+        Args:
+            clips: (prompt, seconds) of each clip, 0.4 to 9.8 s and more than twice the overlap.
+            overlap: Seconds that neighbours share, at least 0.4.
+            samples: As in a call.
+            preset: As in a call.
+            guidance_scale: As in a call.
+            seed: As in a call.
+            progress: As in a call; every clip reports anew.
+
+        Returns:
+            The whole motions; ``control_error`` is the greatest distance at a joint between two clips (mean
+            over its frames and joints), ``latents`` those of the last clip.
+
+        Raises:
+            ValueError: If an argument is unusable; nothing has run then.
+        """
+        return run_chain(
+            self,
+            clips,
+            overlap=overlap,
+            max_frames=MAX_FRAMES,
+            samples=samples,
+            preset=self.resolve_preset(preset, guidance_scale),
+            seed=seed,
+            progress=progress,
+        )
+
+    @property
+    @abstractmethod
+    def longest(self) -> int:
+        """Frames of the longest motion that the networks can make, which may exceed what a call allows."""
 
     def _drawn_frames(
         self, estimator: LengthEstimator, prompt: str, controls: Sequence[Control], seed: int

@@ -90,38 +90,57 @@ class Scene:
         """Whether the motions are moved onto the floor: they are without height targets."""
         return not self.controls.mask[..., 1].any()
 
-    def terms(self, samples: int, *, padded: int, skeleton: Skeleton) -> tuple[JointTerm, ...]:
+    def terms(
+        self,
+        samples: int,
+        *,
+        padded: int,
+        skeleton: Skeleton,
+        frames: int | None = None,
+        on_floor: bool | None = None,
+    ) -> tuple[JointTerm, ...]:
         """What editing minimises beside the targets, for a batch of ``samples`` clips.
 
         Args:
             samples: Clips of the batch.
             padded: Frames of the padded batch.
             skeleton: Joints and unit.
+            frames: Length of the clips, if they are only the beginning of the scene.
+            on_floor: Whether the motions will be stood on the floor; ``None``: as :attr:`stands_on_floor`.
         """
-        lengths = torch.full((samples,), self.frames)
+        frames = self.frames if frames is None else frames
+        lengths = torch.full((samples,), frames)
         terms: list[JointTerm] = [
             *obstacle_terms(
                 self.obstacles,
-                lengths=lengths.tolist(),
+                lengths=lengths,
+                frames=self.frames,
+                padded=padded,
                 skeleton=skeleton,
                 origin=self.origin,
-                padded=padded,
             ),
             *(
                 ObjectiveTerm(objective, is_batched, lengths, self.origin)
                 for objective, is_batched in self.objectives
             ),
         ]
-        return tuple(OnFloor(term, lengths) if self.stands_on_floor else term for term in terms)
+        if self.stands_on_floor if on_floor is None else on_floor:
+            return tuple(OnFloor(term, lengths) for term in terms)
+        return tuple(terms)
 
     def result(
-        self, features: Float[Tensor, "S T D"], latents: Float[Tensor, "S L C"], *, seconds_taken: float
+        self,
+        features: Float[Tensor, "S T D"],
+        latents: Float[Tensor, "S L C"],
+        *,
+        seconds_taken: float,
+        on_floor: bool | None = None,
     ) -> GenerationResult:
         """Decoded features (de-normalised, networks' frame) as motions in the user's world.
 
-        Without height targets each motion is stood on the floor.
+        Without height targets each motion is stood on the floor, unless ``on_floor`` says otherwise.
         """
-        if self.stands_on_floor:
+        if self.stands_on_floor if on_floor is None else on_floor:
             features = grounded(features)
         motions = tuple(self._motion(clip) for clip in features)
         joints = torch.stack([motion.joints for motion in motions])

@@ -31,7 +31,7 @@ from controlmm.nn.checkpoint import PretrainedModel
 from controlmm.pipelines import folder as files
 from controlmm.pipelines.checks import check_masks_end, check_tlcontrol_sizes
 from controlmm.pipelines.output import GenerationResult
-from controlmm.pipelines.pipeline import MotionPipeline
+from controlmm.pipelines.pipeline import MAX_FRAMES, MotionPipeline
 from controlmm.pipelines.tlcontrol_presets import TLControlPreset, resolve_tlcontrol_preset
 from controlmm.text import TextEncoder, check_same_encoder, load_text_encoder
 
@@ -226,6 +226,11 @@ class TLControl(MotionPipeline[TLControlPreset]):
         if config.latent_norm == "clip":
             return 1.0
         return math.sqrt(config.code_dim * self.transformer.config.max_tokens)
+
+    @property
+    def longest(self) -> int:
+        """See :class:`MotionPipeline`."""
+        return MAX_FRAMES
 
     def padded_frames(self, frames: int) -> int:
         """See :class:`MotionPipeline`; networks of the published form always work on their full length."""

@@ -16,6 +16,7 @@ from controlmm.viewer.pose_strip import draw_pose_strip
 from controlmm.viewer.scene import Scene, scene_of
 from controlmm.viewer.scene_panels import draw_overview, draw_top_view
 from controlmm.viewer.time_panels import draw_clearance, draw_distances, draw_heights
+from controlmm.viewer.timeline_tracks import draw_timeline_tracks, track_names
 
 _SIZE = (15.0, 9.2)  # inches
 _TITLE_CHARACTERS = 100
@@ -46,11 +47,15 @@ def contact_sheet(
     figure = Figure(figsize=_SIZE, facecolor=palette.PAPER)
     FigureCanvasAgg(figure)
     _draw_title(figure, scene, title if title is not None else motion.text)
+    tracks = 0.09 * len(track_names(scene))
     rows = figure.add_gridspec(
-        2, 1, left=0.035, right=0.985, top=0.90, bottom=0.06, height_ratios=[1.0, 1.15], hspace=0.13
-    )
-    draw_pose_strip(figure.add_subplot(rows[0]), scene, frames=frames)
-    columns = rows[1].subgridspec(1, 3, width_ratios=[1.45, 1.0, 1.0], wspace=0.14)
+        3, 1, left=0.035, right=0.985, top=0.90, bottom=0.06, height_ratios=[max(tracks, 1e-3), 1.0, 1.15],
+        hspace=0.1 if tracks else 0.065,
+    )  # fmt: skip
+    place = draw_pose_strip(strip := figure.add_subplot(rows[1]), scene, frames=frames)
+    if scene.timeline:
+        draw_timeline_tracks(figure.add_subplot(rows[0], sharex=strip), scene, place)
+    columns = rows[2].subgridspec(1, 3, width_ratios=[1.45, 1.0, 1.0], wspace=0.14)
     draw_overview(figure.add_subplot(columns[0]), scene)
     draw_top_view(figure.add_subplot(columns[1]), scene)
     curves = [draw_heights]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Ellipse
@@ -26,8 +28,11 @@ def shown_frames(scene: Scene, count: int) -> list[int]:
     return [int(frame) for frame in np.unique(even)]
 
 
-def draw_pose_strip(axes: Axes, scene: Scene, *, frames: int) -> None:
-    """Draw the poses from left to right on one ground line, the time in seconds under each."""
+def draw_pose_strip(axes: Axes, scene: Scene, *, frames: int) -> Callable[[float], float]:
+    """Draw the poses from left to right on one ground line, the time in seconds under each.
+
+    Returns where a frame stands across the axes.
+    """
     camera = Camera(elevation=10.0)
     shown = shown_frames(scene, frames)
     centered = scene.joints[shown] - scene.joints[shown][:, :1] * np.array([1.0, 0.0, 1.0])
@@ -48,6 +53,8 @@ def draw_pose_strip(axes: Axes, scene: Scene, *, frames: int) -> None:
     axes.set_ylim(bottom - 0.2, top)
     axes.set_aspect("equal")
     axes.axis("off")
+    ways = spacing * np.arange(len(shown))
+    return lambda frame: float(np.interp(frame, shown, ways)) if len(shown) > 1 else 0.0
 
 
 def _draw_pose(axes: Axes, scene: Scene, frame: int, *, camera: Camera, shift: float) -> None:
