@@ -48,16 +48,16 @@ def _obstacle(rng: np.random.Generator, distance: float, ahead: np.ndarray) -> A
     along = rng.uniform(_CLEAR + size, distance - _CLEAR - size)
     foot = along * ahead + rng.uniform(-_BESIDE, _BESIDE) * left
     if kind == "ball":
-        return Avoid(Sphere([*foot, 0, rng.uniform(0.6, 1.2), 0], size))
+        return Avoid(Sphere(foot + np.array([0, rng.uniform(0.6, 1.2), 0]), size))
     if kind == "pillar":
-        return Avoid(Capsule(foot, [*foot, 0, 2.0, 0], 0.6 * size))
+        return Avoid(Capsule(foot, foot + np.array([0, 2.0, 0]), 0.6 * size))
     if kind == "crate":
         extents = rng.uniform(0.15, 0.35, 3)
-        return Avoid(Box([*foot, 0, extents[1], 0], extents, yaw_matrix(rng.uniform(0, 90))))
+        return Avoid(Box(foot + np.array([0, extents[1], 0]), extents, yaw_matrix(rng.uniform(0, 90))))
     side, height = rng.choice([-2.0, 2.0]), np.array([0.0, rng.uniform(0.6, 1.2), 0.0])
     when = int(FRAMES * along / distance)  # it crosses when a steady walker would be there
     span = rng.integers(15, 30)
     return Avoid(
-        Sphere([foot + height + side * left, foot + height - side * left], size),
+        Sphere(np.stack([foot + height + side * left, foot + height - side * left]), size),
         frames=[max(0, when - span), min(FRAMES - 1, when + span)],
     )
