@@ -18,6 +18,7 @@ from controlmm import TLControl
 from controlmm.data import FeatureClip, MotionFolder
 from controlmm.evaluation.control_errors import control_errors
 from controlmm.models.rvq_vae import frame_mask
+from controlmm.motion.skeleton import Skeleton
 from controlmm.ops import frames_last, guidance_value_and_grad, recover_joints
 from controlmm.pipelines import TLCONTROL_PRESETS, TLControlPreset
 from controlmm.training.trajectory_masks import hide_segments
@@ -47,8 +48,9 @@ _PRESET = TLControlPreset(temperature=0.0)
 class Clips:
     """A batch of recorded clips, padded."""
 
-    text: Tensor  # (B, E)
+    captions: list[str]
     lengths: list[int]  # frames
+    features: Tensor  # (B, T, D), de-normalised
     joints: Tensor  # (B, T, J, 3)
 
     @property
@@ -56,10 +58,10 @@ class Clips:
         """(B, T)"""
         return frame_mask(torch.tensor(self.lengths), self.joints.shape[1])
 
-    def mask(self, names: Sequence[str], pipeline: TLControl) -> Tensor:
+    def mask(self, names: Sequence[str], skeleton: Skeleton) -> Tensor:
         """(B, T, J): ``names`` in every frame."""
         mask = torch.zeros(self.joints.shape[:3], dtype=torch.bool)
-        mask[:, :, [pipeline.skeleton.joint_index(name) for name in names]] = True
+        mask[:, :, [skeleton.joint_index(name) for name in names]] = True
         return mask & self.frames[..., None]
 
 
@@ -75,7 +77,7 @@ class Measured:
     seconds: float  # of optimisation, a clip
 
 
-def read_clips(pipeline: TLControl, data: Path, *, split: str, limit: int) -> list[Clips]:
+def read_clips(skeleton: Skeleton, data: Path, *, split: str, limit: int) -> list[Clips]:
     """``limit`` clips of the split with their first caption, spread over it, in batches of like length."""
     every = [
         clip
@@ -84,14 +86,15 @@ def read_clips(pipeline: TLControl, data: Path, *, split: str, limit: int) -> li
     ]
     step = max(1, len(every) // limit)
     chosen = sorted(every[::step][:limit], key=lambda clip: len(clip.features))
-    return [_batch(pipeline, chosen[at : at + _BATCH]) for at in range(0, len(chosen), _BATCH)]
+    return [_batch(skeleton, chosen[at : at + _BATCH]) for at in range(0, len(chosen), _BATCH)]
 
 
-def _batch(pipeline: TLControl, clips: Sequence[FeatureClip]) -> Clips:
+def _batch(skeleton: Skeleton, clips: Sequence[FeatureClip]) -> Clips:
     features = [clip.features[: min(len(clip.features), _LONGEST) // 4 * 4] for clip in clips]
-    joints = recover_joints(pad_sequence(features, batch_first=True), joints=pipeline.skeleton.num_joints)
-    text = pipeline.text_encoder.encode([clip.captions[0].text for clip in clips]).pooled
-    return Clips(text, [len(x) for x in features], joints)
+    padded = pad_sequence(features, batch_first=True)
+    joints = recover_joints(padded, joints=skeleton.num_joints)
+    captions = [clip.captions[0].text for clip in clips]
+    return Clips(captions, [len(x) for x in features], padded, joints)
 
 
 @torch.no_grad()
@@ -104,7 +107,7 @@ def measure(
         mask = mask_of(clips)
         coordinates = mask[..., None].expand_as(clips.joints)
         predicted = pipeline.generate_latents(
-            clips.text,
+            pipeline.text_encoder.encode(clips.captions).pooled,
             lengths=clips.lengths,
             targets=clips.joints,
             mask=coordinates,
@@ -135,7 +138,9 @@ def measure(
 def joints_table(pipeline: TLControl, batches: Sequence[Clips]) -> list[tuple[str, ...]]:
     """The paper's Table 1 and supplementary Table 2: dense trajectories at tolerance 1e-6."""
     return [_HEAD] + [
-        _row(name, measure(pipeline, batches, _PRESET, lambda clips, n=names: clips.mask(n, pipeline)))
+        _row(
+            name, measure(pipeline, batches, _PRESET, lambda clips, n=names: clips.mask(n, pipeline.skeleton))
+        )
         for name, names in JOINT_SETS.items()
     ]
 
@@ -147,7 +152,7 @@ def tolerance_table(pipeline: TLControl, batches: Sequence[Clips]) -> list[tuple
         for tolerance in TOLERANCES:
             preset = replace(_PRESET, tolerance=tolerance, rate=rate)
             measured = measure(
-                pipeline, batches, preset, lambda clips: clips.mask(JOINT_SETS["all six"], pipeline)
+                pipeline, batches, preset, lambda clips: clips.mask(JOINT_SETS["all six"], pipeline.skeleton)
             )
             rows.append(_row(f"{tolerance:.0e}, rate {rate:g}", measured))
     return rows
@@ -160,7 +165,7 @@ def masked_table(pipeline: TLControl, batches: Sequence[Clips]) -> list[tuple[st
 
         def mask_of(clips: Clips, share: float = share) -> Tensor:
             torch.manual_seed(0)
-            mask = clips.mask(JOINT_SETS["all six"], pipeline)
+            mask = clips.mask(JOINT_SETS["all six"], pipeline.skeleton)
             for row, length in zip(mask, clips.lengths, strict=True):
                 for joint in row.any(0).nonzero()[:, 0].tolist():
                     row[:, joint] &= ~hide_segments(len(row), share, span=length)
@@ -203,7 +208,7 @@ def time_table(pipeline: TLControl, batches: Sequence[Clips]) -> list[tuple[str,
     rows = [("part", "ms", "share")]
     rows += [(name, f"{1000 * s:.2f}", f"{s / total:.0%}") for name, s in median.items()]
     rows.append(("an evaluation", f"{1000 * total:.2f}", "100%"))
-    pelvis = measure(pipeline, batches, _PRESET, lambda clips: clips.mask(("pelvis",), pipeline))
+    pelvis = measure(pipeline, batches, _PRESET, lambda clips: clips.mask(("pelvis",), pipeline.skeleton))
     frames = statistics.fmean(length for clips in batches for length in clips.lengths)
     rows.append(("a frame of a clip, pelvis controlled", f"{1000 * pelvis.seconds / frames:.2f}", ""))
     return rows
@@ -252,12 +257,16 @@ def main() -> None:
     parser.add_argument("--limit", type=int, default=64, help="clips")
     arguments = parser.parse_args()
     pipeline = TLControl.from_pretrained(arguments.model)
-    batches = read_clips(pipeline, arguments.data, split=arguments.split, limit=arguments.limit)
+    batches = read_clips(pipeline.skeleton, arguments.data, split=arguments.split, limit=arguments.limit)
     rows = TABLES[arguments.table](pipeline, batches)
     count = sum(len(clips.lengths) for clips in batches)
-    print(f"{count} clips, {torch.get_num_threads()} threads\n")
-    print("| " + " | ".join(rows[0]) + " |\n|" + " --- |" * len(rows[0]))
-    print("\n".join("| " + " | ".join(row) + " |" for row in rows[1:]))
+    print(f"{count} clips, {torch.get_num_threads()} threads\n\n{markdown(rows)}")
+
+
+def markdown(rows: Sequence[Sequence[str]]) -> str:
+    """A table; the first row has its titles."""
+    lines = ["| " + " | ".join(row) + " |" for row in rows]
+    return "\n".join([lines[0], "|" + " --- |" * len(rows[0]), *lines[1:]])
 
 
 if __name__ == "__main__":

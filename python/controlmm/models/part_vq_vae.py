@@ -16,6 +16,7 @@ from controlmm.motion.skeleton import skeleton_of_width
 from controlmm.nn.conv import ConvDecoder, ConvEncoder
 from controlmm.nn.part_quantizer import PartQuantizer
 
+_PUBLISHED_TOKENS = 49  # of the published training, which pads every clip to 196 frames
 _LEAST_NORM = 1e-8  # keeps a latent of zeros finite; the published code divides by zero
 
 
@@ -78,6 +79,11 @@ class PartVqVaeConfig:
     def num_parts(self) -> int:
         """Codes of one token."""
         return len(body_parts(skeleton_of_width(self.feature_dim))) if self.is_split else 1
+
+    @property
+    def published_unit(self) -> float:
+        """What a published latent is in these: there a part has norm 1 over a clip of 49 tokens."""
+        return 1.0 if self.latent_norm == "clip" else math.sqrt(self.code_dim * _PUBLISHED_TOKENS)
 
     @property
     def latent_dim(self) -> int:

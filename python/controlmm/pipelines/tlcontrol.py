@@ -6,7 +6,6 @@ Source: Wan et al., TLControl: Trajectory and Language Control for Human Motion 
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,12 +14,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from controlmm.generation.code_optimization import optimize_codes
 from controlmm.generation.code_sampling import draw_part_codes
-from controlmm.generation.foot_terms import ContactTerm, PublishedFootTerm
 from controlmm.generation.motion_decoder import MotionDecoder
-from controlmm.generation.solvers import LbfgsTolerance, Progress, Solution, Stopping, lbfgs
+from controlmm.generation.solvers import Progress, Solution
 from controlmm.generation.terms import JointTerm
-from controlmm.generation.trajectory_objective import Rescaled, trajectory_objective
 from controlmm.models.length_estimator import LengthEstimator
 from controlmm.models.part_vq_vae import PartVqVae
 from controlmm.models.rvq_vae import frame_mask
@@ -34,9 +32,6 @@ from controlmm.pipelines.output import GenerationResult
 from controlmm.pipelines.pipeline import MAX_FRAMES, MotionPipeline
 from controlmm.pipelines.tlcontrol_presets import TLControlPreset, resolve_tlcontrol_preset
 from controlmm.text import TextEncoder, check_same_encoder, load_text_encoder
-
-_METRE = {"m": 1.0, "mm": 1000.0}  # in a skeleton's unit
-_EVALUATIONS_A_STEP = 1.25  # at most, on average: what the released code's L-BFGS may spend
 
 
 class TLControl(MotionPipeline[TLControlPreset]):
@@ -202,30 +197,17 @@ class TLControl(MotionPipeline[TLControlPreset]):
             terms: Minimised beside the distance.
             progress: Called after every evaluation.
         """
-        frames = valid.repeat_interleave(self.decoder.downsample, dim=1)
-        every_term = [*terms, *self._foot_terms(latents, frames, mask, preset)]
-        objective = trajectory_objective(preset.loss, self.decoder, targets, mask, frames, terms=every_term)
-        limit = max(1, round(_EVALUATIONS_A_STEP * preset.iterations))
-        unit = self._latent_unit
-        solution = lbfgs(
-            Rescaled(objective, unit=unit),
-            latents / unit,
-            valid[..., None].float(),
-            Stopping(iterations=preset.iterations, evaluations=limit),
-            rate=preset.rate,
-            history=preset.history,
-            tolerance=LbfgsTolerance(change=preset.tolerance * _METRE[self.skeleton.unit] ** 2),
+        return optimize_codes(
+            self.decoder,
+            latents,
+            valid,
+            targets,
+            mask,
+            preset,
+            unit=self.tokenizer.config.published_unit,
+            terms=terms,
             progress=progress,
         )
-        return dataclasses.replace(solution, latents=solution.latents * unit)
-
-    @property
-    def _latent_unit(self) -> float:
-        """What a published latent is in ours: there a part has norm 1 over a clip of the longest length."""
-        config = self.tokenizer.config
-        if config.latent_norm == "clip":
-            return 1.0
-        return math.sqrt(config.code_dim * self.transformer.config.max_tokens)
 
     @property
     def longest(self) -> int:
@@ -259,16 +241,6 @@ class TLControl(MotionPipeline[TLControlPreset]):
         varied = None if preset.vary is None else part_index(preset.vary)
         ids = draw_part_codes(logits, seeds, temperature=preset.temperature, varied=varied)
         return self.tokenizer.quantizer.lookup(ids.where(valid[..., None], -1))
-
-    def _foot_terms(
-        self, latents: Tensor, frames: Tensor, mask: Tensor, preset: TLControlPreset
-    ) -> list[JointTerm]:
-        weight = 2.0 if preset.loss == "half_square" else 1.0  # that form halves its terms
-        if preset.foot == "contact":
-            return [ContactTerm.of_motion(self.decoder, latents, frames, mask, weight=weight)]
-        if preset.foot == "published":
-            return [PublishedFootTerm(frames, self.skeleton, weight=weight)]
-        return []
 
 
 def _padded(dense: Tensor, frames: int) -> Tensor:
