@@ -227,12 +227,15 @@ def test_two_runs_for_one_network_are_named(published, tmp_path):
         convert([published], tmp_path / "model")
 
 
-def test_the_evaluators_file_is_left_and_said_so(published, tmp_path):
+def test_what_is_left_is_said_so(published, tmp_path):
     write_run(
         published / "text_mot_match", "finest.tar", {"movement_encoder": {"main.0.weight": torch.ones(1)}}
     )
     report = convert([published], tmp_path / "model")
-    assert any("text_mot_match" in note and "holds no network of this model" in note for note in report.notes)
+    assert "text_mot_match/model/finest.tar was left: it holds no network of this model." in report.notes
+    for unused in (MASKED, PELVIS):
+        assert f"{unused}/model/latest.tar was left: another took its place." in report.notes
+    assert len(report.notes) == 4
 
 
 def test_parts_of_different_sizes_are_refused(published, tmp_path):

@@ -54,6 +54,8 @@ def test_a_row_has_every_metric_once_a_repeat(
     assert rebuilt["fid"].mean > 0
     assert quick["average_joint"].mean > 0
     assert quick["trajectory_50_joint"].mean == quick["trajectory_50_frame"].mean  # one joint
+    assert quick["average_of_pelvis"].mean == quick["average_joint"].mean
+    assert torch.isnan(torch.tensor(quick["average_of_head"].mean))  # not controlled
     assert torch.isnan(torch.tensor(quick["r1"].mean))  # six clips are no group of 32
     assert quick.clips == 6
     assert quick.about["preset"]["steps"] == 2

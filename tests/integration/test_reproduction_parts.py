@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -15,9 +16,11 @@ from controlmm.evaluation.random_streams import stream
 from controlmm.evaluation.reproduction import mean_of
 from controlmm.evaluation.scores import RowScores
 from controlmm.evaluation.test_set import TestSet, read_test_set
+from controlmm.evaluation.tlcontrol_tables import TABLES as TL_TABLES
+from controlmm.evaluation.tlcontrol_tables import Duel
 from controlmm.generation.editing import EditingBudget
 from controlmm.motion.skeleton import HUMANML3D
-from controlmm.pipelines import ControlMM, Preset
+from controlmm.pipelines import ControlMM, Preset, TLControl
 
 PLAIN = Preset(EditingBudget(latent_iterations=0), steps=2)
 ROUNDING = 1e-4  # of joints in metres, float32
@@ -63,6 +66,54 @@ def test_effort_scales_the_papers_iterations(tiny_pipeline: ControlMM) -> None:
 def test_the_ablation_has_the_papers_eight_cases(tiny_pipeline: ControlMM) -> None:
     table = TABLES["table3"](Study(tiny_pipeline))
     assert [line.keys for line in table.lines] == [row[:4] for row in table.published.rows]
+
+
+METRICS = (
+    "r1", "r2", "r3", "fid", "mm_distance", "diversity", "skating_published", "trajectory_50_joint",
+    "location_50_joint", "average_joint", "seconds", "frames",
+    *(f"average_of_{HUMANML3D.joint_names[joint]}" for joint in HUMANML3D.control_joints),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "ours"),
+    [
+        ("table1", 9), ("table2", 2), ("table3", 8), ("table4", 5), ("table5", 6), ("table7", 9),
+        ("table8", 6), ("table9", 6), ("tl-table1", 15), ("tl-fig7", 12),
+    ],
+)  # fmt: skip
+def test_our_lines_fill_every_column_of_the_paper(
+    tiny_pipeline: ControlMM, tiny_tlcontrol: TLControl, name: str, ours: int
+) -> None:
+    if name in TABLES:
+        table = TABLES[name](Study(tiny_pipeline))
+    else:
+        table = TL_TABLES[name](Duel(tiny_tlcontrol, tiny_pipeline))
+    labels = [row.label for row in table.rows]
+    assert len(set(labels)) == len(labels)
+    scores = [RowScores(label, {key: [0.5] for key in METRICS}, 32, {}) for label in labels]
+    lines = table.markdown(scores).splitlines()[2 + len(table.published.rows) :]
+    assert len(lines) == ours
+    for line in lines:
+        assert len(line.split(" | ")) == len(table.published.columns) + 2  # who, and seconds
+        assert re.search(r"\| ours \| (0\.50* \| |50\.00 \| )+", line)
+
+
+def test_accuracy_settings_stand_over_the_joints(tiny_pipeline: ControlMM, tiny_tlcontrol: TLControl) -> None:
+    table = TL_TABLES["tl-table4"](Duel(tiny_tlcontrol, tiny_pipeline))
+    values = {"seconds": [0.25], "average_joint": [0.02]}
+    values |= {name: [0.01] for name in METRICS if name.startswith("average_of")}
+    lines = table.markdown([RowScores(row.label, values, 32, {}) for row in table.rows]).splitlines()
+    assert "| runtime per batch (s) | 8.00 | 8.00 | 8.00 | 8.00 | 8.00 |" in lines
+    assert "| left hand | 1.00 | 1.00 | 1.00 | 1.00 | 1.00 |" in lines
+    assert "| average | 2.00 | 2.00 | 2.00 | 2.00 | 2.00 |" in lines
+
+
+def test_tables_of_kit_need_a_model_of_kit(tiny_pipeline: ControlMM, tiny_tlcontrol: TLControl) -> None:
+    with pytest.raises(ValueError, match="table10 is of KIT-ML"):
+        TABLES["table10"](Study(tiny_pipeline))
+    with pytest.raises(ValueError, match="tl-table2 is of KIT-ML"):
+        TL_TABLES["tl-table2"](Duel(tiny_tlcontrol, tiny_pipeline))
 
 
 def test_an_average_is_taken_repeat_by_repeat() -> None:

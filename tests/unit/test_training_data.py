@@ -89,6 +89,20 @@ def test_mixed_masks_hold_every_kind_of_control_inside_the_clip():
     assert masks.any(1).any(2).any(0).all()  # every joint is controlled in some clip
 
 
+def test_a_tenth_of_the_mixed_joint_controls_leaves_axes_free():
+    torch.manual_seed(0)
+    masks = mixed_masks(torch.ones(3000, 30, dtype=torch.bool), joints=22, favoured=HUMANML3D.control_joints)
+    held = masks.any(1)[:, 1:]  # (clips, joints but the pelvis, axes)
+    controlled = held[held.any(-1)]
+    free = ~controlled.all(-1)
+    # poses hold all axes of all 21 joints and are left out
+    poses = 21 * masks.flatten(2).all(2).any(1).sum()
+    share = (free.sum() / (len(controlled) - poses)).item()
+    assert share == pytest.approx(0.1, abs=standard_error(0.1, len(controlled) - int(poses)))
+    assert set(controlled[free].sum(-1).tolist()) == {1, 2}
+    assert controlled[free].any(0).all()  # each axis is held alone or with another
+
+
 def test_sparse_control_is_common():
     torch.manual_seed(0)
     counts = torch.tensor([len(random_frames(100)) for _ in range(2000)])

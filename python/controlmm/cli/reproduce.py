@@ -12,19 +12,26 @@ from controlmm.cli.evaluate import KINDS, facts_of, listed
 
 if TYPE_CHECKING:
     from controlmm.evaluation.protocol import Protocol
+    from controlmm.evaluation.reproduction import Reproduction
+    from controlmm.evaluation.scores import RowScores
     from controlmm.evaluation.test_set import TestSet
-    from controlmm.pipelines.controlmm import ControlMM
 
 CONFIDENCE = "confidence"  # Figures 7 to 11
-_TABLES = "table1 to table9, confidence (Figures 7 to 11)"
+_TABLES = "table1 to table10, confidence (Figures 7 to 11); of TLControl: tl-table1 to tl-table4, tl-fig7."
 
 
 def reproduce(
     table: Annotated[str, typer.Argument(help=_TABLES)],
     data: Annotated[Path, typer.Option(help="HumanML3D folder, or a folder of npz packs.")],
-    out: Annotated[Path, typer.Option(help="Folder for results; the same command goes on in it.")],
+    out: Annotated[
+        Path, typer.Option(help="Folder; the table gets one in it, where the same command goes on.")
+    ],
     model: Annotated[
         Path | None, typer.Option(help="ControlMM folder.", show_default="the one in the package")
+    ] = None,
+    tlcontrol: Annotated[
+        Path | None,
+        typer.Option(help="TLControl folder, for the tl- tables.", show_default="the one in the package"),
     ] = None,
     limit: Annotated[
         int | None, typer.Option(help="Clips a row and repeat, for a quick look.", show_default="all")
@@ -44,35 +51,55 @@ def reproduce(
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
 ) -> None:
     """Print a table of the paper with our rows beneath; write it, JSON and pictures to a folder."""
-    from controlmm.cli.result_pictures import save_pictures
-    from controlmm.evaluation.controlmm_tables import TABLES, Study
     from controlmm.evaluation.evaluators import load_evaluator
     from controlmm.evaluation.protocol import Protocol, evaluate_rows
-    from controlmm.evaluation.report import write_json
     from controlmm.evaluation.test_set import read_test_set
-    from controlmm.pipelines import ControlMM
-    from controlmm.pipelines.presets import preset_named
 
     started = time.perf_counter()
-    if table not in (*TABLES, CONFIDENCE):
-        raise ValueError(f"Unknown table {table!r}. Tables: {', '.join((*TABLES, CONFIDENCE))}.")
-    for name in preset or ():
-        preset_named(name)
     protocol = Protocol(repeats, limit, seed)
-    study = Study(ControlMM.from_pretrained(model), effort, tuple(preset or ()))
-    test_set = read_test_set(data, kinds=listed(captions))
     if table == CONFIDENCE:
-        _confidence(study.pipeline, test_set, protocol, effort, out)
+        _confidence(model, read_test_set(data, kinds=listed(captions)), protocol, effort, out)
         return
+    plan = _plan(table, model, tlcontrol, effort, tuple(preset or ()))
     judge = load_evaluator(evaluator)
-    plan = TABLES[table](study)
-    scores = evaluate_rows(plan.rows, test_set, judge, protocol, out, progress=not quiet)
+    test_set = read_test_set(data, kinds=listed(captions))
+    scores = evaluate_rows(plan.rows, test_set, judge, protocol, out / table, progress=not quiet)
     facts = facts_of(test_set, protocol, seconds=time.perf_counter() - started)
     facts["editing iterations"] = "the paper's" if effort == 1 else f"{effort:g} of the paper's"
-    notes = [*plan.notes, judge.caution]
-    text = _page(f"{table}: {plan.published.title}", facts, plan.markdown(scores), notes)
-    (out / f"{table}.md").write_text(text, encoding="utf-8")
-    write_json(out / f"{table}.json", {"table": table, **facts, "rows": [s.as_json() for s in scores]})
+    _write(plan, scores, facts, judge.caution, out / table)
+
+
+def _plan(
+    table: str, model: Path | None, tlcontrol: Path | None, effort: float, presets: tuple[str, ...]
+) -> Reproduction:
+    from controlmm.evaluation.controlmm_tables import TABLES, Study
+    from controlmm.evaluation.tlcontrol_tables import TABLES as TL_TABLES
+    from controlmm.evaluation.tlcontrol_tables import Duel
+    from controlmm.pipelines import ControlMM, TLControl
+    from controlmm.pipelines.presets import preset_named
+
+    if table not in TABLES and table not in TL_TABLES:
+        raise ValueError(f"Unknown table {table!r}. Tables: {', '.join((*TABLES, CONFIDENCE, *TL_TABLES))}.")
+    for name in presets:
+        preset_named(name)
+    study = Study(ControlMM.from_pretrained(model), effort, presets)
+    if table in TABLES:
+        return TABLES[table](study)
+    duel = Duel(TLControl.from_pretrained(tlcontrol), study.pipeline, presets or ("balanced",))
+    return TL_TABLES[table](duel)
+
+
+def _write(
+    plan: Reproduction, scores: list[RowScores], facts: dict[str, Any], caution: str, out: Path
+) -> None:
+    """Print the table; write it as Markdown and JSON, and the pictures that go with it."""
+    from controlmm.cli.result_pictures import save_pictures
+    from controlmm.evaluation.report import write_json
+
+    text = _page(f"{plan.name}: {plan.published.title}", facts, plan.markdown(scores), [*plan.notes, caution])
+    (out / f"{plan.name}.md").write_text(text, encoding="utf-8")
+    rows = [score.as_json() for score in scores]
+    write_json(out / f"{plan.name}.json", {"table": plan.name, **facts, "caution": caution, "rows": rows})
     typer.echo(text)
     for picture in save_pictures(plan, scores, out):
         typer.echo(str(picture))
@@ -84,19 +111,23 @@ def _page(title: str, facts: dict[str, Any], table: str, notes: list[str]) -> st
     return f"# {title}\n\n{table}\n\n{foot}\n\n{said}\n"
 
 
-def _confidence(pipeline: ControlMM, test_set: TestSet, protocol: Protocol, effort: float, out: Path) -> None:
+def _confidence(model: Path | None, test_set: TestSet, protocol: Protocol, effort: float, out: Path) -> None:
     """One batch of pelvis control at a quarter of the frames."""
     from controlmm.evaluation.confidence import confidence_records, mean_confidence
     from controlmm.evaluation.control_draws import ControlSetting
     from controlmm.evaluation.motion_sources import Batch
     from controlmm.evaluation.protocol import batches_of
     from controlmm.evaluation.report import pipe_table
+    from controlmm.pipelines import ControlMM
     from controlmm.viewer.evaluation_charts import save_confidence
 
     started = time.perf_counter()
     samples, masks = zip(*next(batches_of(test_set, ControlSetting("pelvis", 49), protocol, 0)), strict=True)
+    out = out / CONFIDENCE
     batch = Batch.of(samples, masks, seed=protocol.seed, repeat=0)
-    records = confidence_records(pipeline, batch, iterations=max(1, round(100 * effort)))
+    records = confidence_records(
+        ControlMM.from_pretrained(model), batch, iterations=max(1, round(100 * effort))
+    )
     steps = [str(step + 1) for step in range(len(records[0].mean))]
     table = pipe_table(["step", *steps], mean_confidence(records))
     facts = facts_of(test_set, protocol, seconds=time.perf_counter() - started)

@@ -11,7 +11,7 @@ import torch
 from controlmm.convert.control import check_same_tokenizer, control_joints, import_control
 from controlmm.convert.momask import import_length, import_masked, import_residual, import_rvq
 from controlmm.convert.output_folder import check_free, new_folder
-from controlmm.convert.report import ConversionReport
+from controlmm.convert.report import ConversionReport, short_path
 from controlmm.convert.run_folders import Checkpoint, find_checkpoints
 from controlmm.convert.statistics import read_statistics
 from controlmm.models.control_branch import ControlBranch, ControlBranchConfig
@@ -51,8 +51,10 @@ def convert(paths: Sequence[Path], out: Path, *, control: ControlKind | None = N
     check_free(out)
     report = ConversionReport(out)
     found, others = find_checkpoints(paths)
-    report.notes += [f"{path} holds no network of this model and was left." for path in others]
     normalizer, networks = _networks(found, control, report)
+    unused = [checkpoint.file for checkpoint in found if checkpoint.file not in report.used.values()]
+    report.notes += [f"{short_path(path)} was left: another took its place." for path in unused]
+    report.notes += [f"{short_path(path)} was left: it holds no network of this model." for path in others]
     with new_folder(out) as folder:
         for name, network in networks.items():
             network.save_pretrained(folder / name)

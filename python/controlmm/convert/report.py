@@ -23,10 +23,7 @@ class ConversionReport:
 
     def card(self) -> str:
         """A README for the model folder: every network's file with its hash, and the notes."""
-        rows = [
-            f"| {role} | `{'/'.join(path.parts[-3:])}` | `{_sha256(path)}` |"
-            for role, path in self.used.items()
-        ]
+        rows = [f"| {role} | `{short_path(path)}` | `{_sha256(path)}` |" for role, path in self.used.items()]
         lines = [
             "# A converted model",
             "",
@@ -39,6 +36,11 @@ class ConversionReport:
             *(f"- {note}" for note in self.notes),
         ]
         return "\n".join(lines) + "\n"
+
+
+def short_path(path: Path) -> str:
+    """Run folder, ``model`` and file: where it lay on one machine says nothing to others."""
+    return "/".join(path.parts[-3:])
 
 
 def _sha256(path: Path) -> str:

@@ -121,6 +121,11 @@ def _numbers(batch: Batch, produced: Produced) -> dict[str, Tensor]:
         for threshold, values in errors.location.items():
             numbers[f"location_{_centimetres(threshold)}_{rule}"] = values
         numbers[f"average_{rule}"] = errors.average
+    for joint in skeleton.control_joints:
+        alone = torch.zeros_like(batch.mask)
+        alone[..., joint] = batch.mask[..., joint]
+        errors = control_errors(metres * joints, metres * batch.joints, alone)
+        numbers[f"average_of_{skeleton.joint_names[joint]}"] = errors.average
     return {name: value.float() for name, value in numbers.items()}
 
 

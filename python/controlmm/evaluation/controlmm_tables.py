@@ -14,6 +14,7 @@ from controlmm.evaluation.protocol import Row
 from controlmm.evaluation.reproduction import Line, Reproduction
 from controlmm.evaluation.scores import RowScores
 from controlmm.models.control_branch import ControlBranch
+from controlmm.motion.skeleton import KIT, Skeleton
 from controlmm.pipelines.controlmm import ControlMM
 from controlmm.pipelines.presets import PRESETS, Preset
 
@@ -195,9 +196,28 @@ def table9(study: Study) -> Reproduction:
     return Reproduction("table9", lines)
 
 
+def table10(study: Study) -> Reproduction:
+    """KIT-ML, control of the root.
+
+    Raises:
+        ValueError: If the model is not of KIT-ML.
+    """
+    check_is_kit(study.pipeline.skeleton, "table10")
+    real = Line(("Real",), Row("real motion", RealMotion(), _PELVIS))
+    return Reproduction("table10", [real, study.line(("ControlMM",), study.accurate)])
+
+
+def check_is_kit(skeleton: Skeleton, table: str) -> None:
+    """Raise ``ValueError`` unless the skeleton is KIT-ML's."""
+    if skeleton != KIT:
+        raise ValueError(
+            f"{table} is of KIT-ML: pass a KIT-ML folder as `--data`, and a model and an evaluator of it."
+        )
+
+
 TABLES: dict[str, Callable[[Study], Reproduction]] = {
     maker.__name__: maker
-    for maker in (table1, table2, table3, table4, table5, table6, table7, table8, table9)
+    for maker in (table1, table2, table3, table4, table5, table6, table7, table8, table9, table10)
 }
 
 

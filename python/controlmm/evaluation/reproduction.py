@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from controlmm.evaluation.protocol import Row
 from controlmm.evaluation.published_tables import PublishedTable, published_table
@@ -46,19 +46,24 @@ class Reproduction:
     Attributes:
         name: Of the published table.
         lines: Our rows.
-        average_of: Keys of a line that is the mean of the lines before it whose numbers are given.
+        average: Keys of a line that is the mean of lines, and the numbers of those.
         own_table: For tables that are not a line a system: makes titles and lines of ours from the scores.
+        columns: For figures, whose numbers the paper does not give: titles of our columns.
+        notes: Sentences for the foot.
     """
 
     name: str
     lines: Sequence[Line]
     average: tuple[tuple[str, ...], Sequence[int]] | None = None
     own_table: Callable[[Sequence[RowScores]], tuple[list[str], list[list[str]]]] | None = None
-    notes: Sequence[str] = field(default_factory=tuple)
+    columns: tuple[str, ...] = ()
+    notes: Sequence[str] = ()
 
     @property
     def published(self) -> PublishedTable:
-        """The paper's table."""
+        """The paper's table; for a figure one without rows."""
+        if self.columns:
+            return PublishedTable(self.name, "a figure without printed numbers", self.columns, ())
         return published_table(self.name)
 
     @property

@@ -16,6 +16,7 @@ _LONGEST = 196  # frames; the published modes draw the number of controlled ones
 # Shares of the kinds of control in training. The published modes are `trajectory` and `cross` with a uniform
 # density; ours is heavy on sparse targets, which people give, and keeps a share without any control.
 _NO_CONTROL, _PATH, _TRAJECTORY, _POSE = 0.1, 0.2, 0.2, 0.1  # the rest: some joints at some frames
+_FREE_AXES = 0.1  # of these joints are held along one or two axes only
 
 
 def mixed_masks(
@@ -43,7 +44,7 @@ def mixed_masks(
             mask[at[:5]] = True
         else:
             for joint in _random_joints(joints, favoured):
-                mask[random_frames(length), joint] = True
+                mask[random_frames(length)[:, None], joint, _random_axes()] = True
     return masks
 
 
@@ -108,6 +109,12 @@ def cross_masks(frames: Bool[Tensor, "B T"], *, joints: int, among: Sequence[int
         chosen = torch.randperm(pairs)[: max(1, round(torch.rand(()).item() * pairs))]
         mask[chosen // len(among), torch.tensor(among)[chosen % len(among)]] = True
     return masks
+
+
+def _random_axes() -> Int[Tensor, "A"]:
+    """All three axes, or now and then one or two of them."""
+    count = 1 + int(torch.randint(2, ())) if torch.rand(()) < _FREE_AXES else 3
+    return torch.randperm(3)[:count]
 
 
 def _random_joints(joints: int, favoured: Sequence[int]) -> list[int]:
