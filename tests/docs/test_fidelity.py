@@ -25,6 +25,7 @@ HOME = {
     "MaskedOptions": "controlmm.training.masked",
     "MaskedTransformerConfig": "controlmm.models.masked_transformer",
     "Preset": "controlmm.pipelines.presets",
+    "ResidualTransformerConfig": "controlmm.models.residual_transformer",
     "RvqOptions": "controlmm.training.rvq",
     "RvqVaeConfig": "controlmm.models.rvq_vae",
     "obstacle_loss": "controlmm.ops",

@@ -255,6 +255,12 @@ def test_unknown_variants_are_refused(published, tmp_path):
         convert([published], tmp_path / "model")
 
 
+def test_a_residual_transformer_without_shared_tables_is_refused(published, tmp_path):
+    (published / RESIDUAL / "opt.txt").write_text("share_weight: False\n")
+    with pytest.raises(ValueError, match="was trained without `share_weight`; no such one is published"):
+        convert([published], tmp_path / "model")
+
+
 def test_nothing_is_overwritten(published, tmp_path):
     (tmp_path / "model").mkdir()
     (tmp_path / "model" / "mine").write_text("x")

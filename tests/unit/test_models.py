@@ -238,6 +238,23 @@ def test_inner_tables_serve_as_input_and_output():
     assert not torch.equal(inputs[0], outputs[4])
 
 
+def test_tables_of_their_own_count_once_beside_the_bias():
+    torch.manual_seed(0)
+    config = replace(ResidualTransformerConfig.tiny(), shares_tables=False)
+    network = ResidualTransformer(config).eval()
+    torch.nn.init.normal_(network.output_bias)
+    assert network.input_tables().data_ptr() != network.output_tables().data_ptr()
+    history, text = torch.randn(2, 4, 16), torch.randn(2, 64)
+    layer, valid = torch.tensor([1, 2]), torch.ones(2, 4, dtype=torch.bool)
+    logits = network(history, layer, text, valid)
+    bias = network.output_bias.data.clone()
+    network.output_bias.data.zero_()
+    scores = network(history, layer, text, valid)
+    torch.testing.assert_close(logits, scores + bias[[0, 1]][:, None])
+    network.own_output_tables.data.mul_(3)
+    torch.testing.assert_close(network(history, layer, text, valid), 3 * scores)
+
+
 def test_each_layer_is_scored_by_its_own_table(residual):
     ids, valid, text = token_batch()
     history = residual.history(ids[..., None].expand(-1, -1, 3), torch.tensor([1, 2]))
@@ -293,7 +310,16 @@ def test_text_is_dropped_clip_by_clip():
         (RvqVaeConfig, {"width": 0}, "Sizes must be positive"),
         (RvqVaeConfig, {"quantize_dropout": 1.5}, r"`quantize_dropout` must be in \[0, 1\]"),
         (MaskedTransformerConfig, {"heads": 5}, "`width` must be a multiple of `heads`, got 384 and 5"),
-        (ResidualTransformerConfig, {"num_quantizers": 2}, "`num_quantizers` must be at least 3"),
+        (
+            ResidualTransformerConfig,
+            {"num_quantizers": 2},
+            "`num_quantizers` must be at least 3 to share tables",
+        ),
+        (
+            ResidualTransformerConfig,
+            {"num_quantizers": 1, "shares_tables": False},
+            "must be at least 2, got 1",
+        ),
         (ControlBranchConfig, {"encoder": "mlp"}, r"`encoder` must be one of .*, got 'mlp'"),
         (ControlBranchConfig, {"joints": ()}, "`joints` must name at least one joint"),
     ],

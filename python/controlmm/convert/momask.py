@@ -95,9 +95,13 @@ def import_residual(state: StateDict, options: Options) -> ResidualTransformer:
     """The residual transformer with shared tables (``share_weight``), as all published ones are.
 
     Raises:
-        ValueError: If weights are missing, unknown or misshapen.
+        ValueError: If weights are missing, unknown or misshapen, or its tables are not shared.
     """
     what = "residual transformer"
+    if options.get("share_weight", True) is False:
+        raise ValueError(
+            "The residual transformer was trained without `share_weight`; no such one is published."
+        )
     shared = weight(state, "embed_proj_shared_weight", what=what)
     config = ResidualTransformerConfig(
         codebook_size=shared.shape[1] - 1,

@@ -37,13 +37,18 @@ class ResidualTransformerConfig:
     text_scale: float = 1.0
     text_dropout: float = 0.2
     max_tokens: int = 98
+    shares_tables: bool = (
+        True  # inner layers score with the table that embeds them, as in all published weights
+    )
 
     def __post_init__(self) -> None:
         if self.width % self.heads:
             raise ValueError(f"`width` must be a multiple of `heads`, got {self.width} and {self.heads}.")
-        if self.num_quantizers < 3:
+        least = 3 if self.shares_tables else 2
+        if self.num_quantizers < least:
             raise ValueError(
-                f"`num_quantizers` must be at least 3 to share tables, got {self.num_quantizers}."
+                f"`num_quantizers` must be at least {least}{' to share tables' * self.shares_tables}, "
+                f"got {self.num_quantizers}."
             )
 
     @classmethod
@@ -82,7 +87,8 @@ class ResidualTransformer(PretrainedModel):
     """Sequence: text token, layer token, ``L`` motion tokens (sums of code embeddings of the earlier layers).
 
     The middle layers' tables serve as input and as output tables; the first input and last output table are
-    their own. Every table has one row more than there are codes, for PAD.
+    their own. Without sharing all tables are their own, and the scores have a bias. Every table has one row
+    more than there are codes, for PAD.
     """
 
     config_class: ClassVar[type] = ResidualTransformerConfig
@@ -91,10 +97,15 @@ class ResidualTransformer(PretrainedModel):
 
     def __init__(self, config: ResidualTransformerConfig) -> None:
         super().__init__(config)
-        rows, shared = config.codebook_size + 1, config.num_quantizers - 2
-        self.first_table = nn.Parameter(torch.randn(1, rows, config.token_dim) * 0.02)
-        self.shared_tables = nn.Parameter(torch.randn(shared, rows, config.token_dim) * 0.02)
-        self.last_table = nn.Parameter(torch.randn(1, rows, config.token_dim) * 0.02)
+        rows, layers = config.codebook_size + 1, config.num_quantizers - 1
+        if config.shares_tables:
+            self.first_table = _fresh_tables(1, rows, config.token_dim)
+            self.shared_tables = _fresh_tables(layers - 1, rows, config.token_dim)
+            self.last_table = _fresh_tables(1, rows, config.token_dim)
+        else:
+            self.own_input_tables = _fresh_tables(layers, rows, config.token_dim)
+            self.own_output_tables = _fresh_tables(layers, rows, config.token_dim)
+            self.output_bias = nn.Parameter(torch.zeros(layers, rows))
         self.token_proj = nn.Linear(config.token_dim, config.width)
         self.text_proj = nn.Linear(config.text_dim, config.width)
         self.layer_proj = nn.Linear(config.num_quantizers, config.width)
@@ -119,10 +130,14 @@ class ResidualTransformer(PretrainedModel):
 
     def input_tables(self) -> Float[Tensor, "Q1 R E"]:
         """Tables that embed the codes of layers 0..Q-2."""
+        if not self.config.shares_tables:
+            return self.own_input_tables
         return torch.cat([self.first_table, self.shared_tables])
 
     def output_tables(self) -> Float[Tensor, "Q1 R E"]:
         """Tables that score the codes of layers 1..Q-1."""
+        if not self.config.shares_tables:
+            return self.own_output_tables
         return torch.cat([self.shared_tables, self.last_table])
 
     def history(self, ids: Int[Tensor, "B L Q"], layer: Int[Tensor, "B"]) -> Float[Tensor, "B L E"]:
@@ -149,4 +164,9 @@ class ResidualTransformer(PretrainedModel):
         sequence = torch.cat([text_token, layer_token, tokens], dim=1)
         hidden = run_layers(self.layers, sequence, with_text_token(valid, 2))
         predicted: Tensor = self.head(hidden[:, 2:])
-        return torch.einsum("ble,bre->blr", predicted, self.output_tables()[layer - 1])
+        logits = torch.einsum("ble,bre->blr", predicted, self.output_tables()[layer - 1])
+        return logits if self.config.shares_tables else logits + self.output_bias[layer - 1][:, None]
+
+
+def _fresh_tables(count: int, rows: int, dim: int) -> nn.Parameter:
+    return nn.Parameter(torch.randn(count, rows, dim) * 0.02)
