@@ -192,3 +192,47 @@ def test_an_empty_split_is_named(tiny_data_folder, walk, tmp_path, split):
         ValueError, match=f"The {'training' if split == 'train' else 'validation'} split has no"
     ):
         train("rvq", tmp_path / "data", tmp_path)
+
+
+@pytest.mark.parametrize("stage", ["rvq", "masked", "control"])
+def test_mixed_precision_computes_in_bfloat16_and_keeps_float32_weights(
+    trained, tiny_data_folder, tmp_path, stage
+):
+    for name in ("normalizer.safetensors", "rvq/best", "masked/best"):
+        if not name.startswith(stage) and stage != "rvq":
+            (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / name).symlink_to(trained / name)
+    seen = set()
+    linear = torch.nn.functional.linear
+    convolution = torch.nn.Conv1d.forward
+
+    def watched(self, x):
+        result = convolution(self, x)
+        seen.add(result.dtype)
+        return result
+
+    def watched_linear(*arguments):
+        result = linear(*arguments)
+        seen.add(result.dtype)
+        return result
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torch.nn.Conv1d, "forward", watched)
+        patch.setattr(torch.nn.functional, "linear", watched_linear)
+        train_stage(
+            stage,
+            data=tiny_data_folder,
+            size="tiny",
+            root=tmp_path,
+            text_encoder=HashingTextEncoder(64),
+            changes={"steps": 3},
+            options={"bf16": "true"},
+            progress=False,
+            device="cpu",
+        )
+    assert torch.bfloat16 in seen
+    weights = load_file(tmp_path / stage / "checkpoint.safetensors")
+    floats = {value.dtype for value in weights.values() if value.is_floating_point()}
+    assert floats == {torch.float32}
+    (start,) = (tmp_path / stage / "starts.jsonl").read_text().splitlines()
+    assert json.loads(start)["device"] == "cpu"

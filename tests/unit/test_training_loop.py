@@ -160,6 +160,44 @@ def test_a_stopped_and_resumed_run_equals_an_unbroken_one_bit_by_bit(tmp_path, s
     assert RunFolder(resumed).records() == RunFolder(unbroken).records()
 
 
+@pytest.mark.parametrize("does_write", [False, True], ids=["before", "after"])
+def test_a_kill_between_any_two_writes_loses_nothing(tmp_path, monkeypatch, does_write):
+    """Ends the run at each of its file replacements in turn; the resumed run is the unbroken one."""
+    settings = replace(AVERAGED, steps=10, validate_every=5, checkpoint_every=5, patience=0)
+    replace_file, calls = Path.replace, []
+
+    def counted(self, target):
+        calls.append(target)
+        return replace_file(self, target)
+
+    monkeypatch.setattr(Path, "replace", counted)
+    fit(LineRecipe(), tmp_path / "unbroken", settings)
+    expected = load_file(tmp_path / "unbroken" / "checkpoint.safetensors")
+    assert len(calls) == 7  # settings, emptied log, twice best and checkpoint, summary
+    for kill in range(len(calls)):
+        run, left = tmp_path / f"killed{kill}", [kill]
+
+        def killed(self, target, left=left):
+            left[0] -= 1
+            if left[0] == -1 and not does_write:
+                raise StoppedError
+            result = replace_file(self, target)
+            if left[0] == -1:
+                raise StoppedError
+            return result
+
+        monkeypatch.setattr(Path, "replace", killed)
+        with pytest.raises(StoppedError):
+            fit(LineRecipe(), run, settings)
+        fit(LineRecipe(), run, settings)
+        actual = load_file(run / "checkpoint.safetensors")
+        assert all(torch.equal(actual[name], expected[name]) for name in expected), kill
+        best, right = (load_file(r / "best" / "model.safetensors") for r in (run, tmp_path / "unbroken"))
+        assert all(torch.equal(best[name], right[name]) for name in right), kill
+        assert RunFolder(run).records() == RunFolder(tmp_path / "unbroken").records(), kill
+        assert (run / "summary.json").is_file()
+
+
 def test_a_finished_run_takes_no_more_steps(tmp_path):
     fit(LineRecipe(), tmp_path)
     recipe = LineRecipe()

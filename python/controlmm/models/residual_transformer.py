@@ -147,7 +147,7 @@ class ResidualTransformer(PretrainedModel):
         embedded = torch.stack(
             [table[ids[..., i]] for i, table in enumerate(tables)], dim=1
         )  # (B, Q-1, L, E)
-        earlier = torch.arange(len(tables)) < layer[:, None]
+        earlier = torch.arange(len(tables), device=layer.device) < layer[:, None]
         return (embedded * earlier[:, :, None, None]).sum(1)
 
     def forward(

@@ -25,6 +25,11 @@ class PretrainedModel(nn.Module):
         super().__init__()
         self.config = config
 
+    @property
+    def device(self) -> torch.device:
+        """Where the network is."""
+        return next(self.parameters()).device
+
     def save_pretrained(self, folder: str | Path, *, dtype: torch.dtype = torch.float32) -> None:
         """Write config and weights; ``dtype=torch.float16`` halves the file."""
         folder = Path(folder)

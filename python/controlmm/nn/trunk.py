@@ -68,4 +68,4 @@ def initialize_weights(module: nn.Module) -> None:
 
 def drop_text(text: Float[Tensor, "B E"], probability: float) -> Float[Tensor, "B E"]:
     """Text vectors, each with ``probability`` set to zero, the vector that stands for "no text"."""
-    return text * (torch.rand(len(text), 1) >= probability)
+    return text * (torch.rand(len(text), 1, device=text.device) >= probability)

@@ -98,30 +98,32 @@ class ControlRecipe:
         return {"stage": "control", "alpha": self.options.cross_entropy_share}
 
     def _losses(self, batch: TokenBatch) -> dict[str, Tensor]:
-        base, frames = self.base, batch.frames
-        ids = batch.ids[..., 0]
+        device = self.model.device
+        base, decoder = self.base.to(device), self.decoder.to(device)
+        skeleton = decoder.normalizer.skeleton
         corrupted, _ = corrupt_tokens(
-            ids,
+            batch.ids[..., 0],
             batch.valid,
             codebook_size=base.config.codebook_size,
             mask_id=base.mask_id,
             pad_id=base.pad_id,
             share_of=self.options.share_of,
         )
+        mask = sample_masks(
+            self.options.masks, batch.frames, joints=skeleton.num_joints, among=skeleton.control_joints
+        )
+        batch, corrupted, mask = batch.to(device), corrupted.to(device), mask.to(device)
+        ids, frames = batch.ids[..., 0], batch.frames
         with torch.no_grad():
             targets = self._joints(batch.features)
-            current = self.decoder(self.decoder.base_latents(corrupted, batch.valid), frames)
-        skeleton = self.decoder.normalizer.skeleton
-        mask = sample_masks(
-            self.options.masks, frames, joints=skeleton.num_joints, among=skeleton.control_joints
-        )
+            current = decoder(decoder.base_latents(corrupted, batch.valid), frames)
 
         drops_text = self.model.training and self.options.drops_text
         text = drop_text(batch.text, base.config.text_dropout) if drops_text else batch.text
         sequence = base.sequence(base.embed(corrupted), text)
         logits = self.model(base, sequence, self.model.signal(targets, mask, current), batch.valid).float()
-        latents = mixed_codes(logits, self.decoder.tokenizer.base_codes, self.options.sampling)
-        joints = self.decoder(latents * batch.valid[..., None], frames)
+        latents = mixed_codes(logits, decoder.tokenizer.base_codes, self.options.sampling)
+        joints = decoder(latents * batch.valid[..., None], frames)
         metres = skeleton.metres
         consistency = masked_consistency_loss(joints * metres, targets * metres, mask, norm=self.options.norm)
         tokens = token_cross_entropy(logits, ids)

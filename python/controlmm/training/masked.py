@@ -98,15 +98,17 @@ class MaskedRecipe:
         return {"stage": "masked"}
 
     def _losses(self, batch: TokenBatch) -> dict[str, Tensor]:
-        base = batch.ids[..., 0]
         corrupted, chosen = corrupt_tokens(
-            base,
+            batch.ids[..., 0],
             batch.valid,
             codebook_size=self.model.config.codebook_size,
             mask_id=self.model.mask_id,
             pad_id=self.model.pad_id,
             share_of=self.options.share_of,
         )
+        device = self.model.device
+        batch, corrupted, chosen = batch.to(device), corrupted.to(device), chosen.to(device)
+        base = batch.ids[..., 0]
         text = drop_text(batch.text, self.model.config.text_dropout) if self.model.training else batch.text
         logits = self.model(self._embed(corrupted), text, batch.valid).float()
         right = logits.argmax(-1) == base
@@ -123,7 +125,7 @@ class MaskedRecipe:
         codes = self.model.config.codebook_size
         is_code = (ids < codes)[..., None]
         one_hot = nn.functional.one_hot(ids.clamp(max=codes - 1), codes).float()
-        noise = torch.randn(one_hot.shape) * self.options.logit_noise_std
+        noise = torch.randn_like(one_hot) * self.options.logit_noise_std
         mask_embedding = self.model.token_embedding.weight[self.model.mask_id]
         return torch.where(is_code, self.model.embed_soft(one_hot + noise), mask_embedding)
 
@@ -137,7 +139,7 @@ class MaskedRecipe:
         if not weight:
             return {"loss": tokens}
         with torch.no_grad():
-            wanted = self.tokenizer.encode_latents(batch.features, batch.frames)
+            wanted = self.tokenizer.to(batch.ids.device).encode_latents(batch.features, batch.frames)
         found = logits.softmax(-1) @ self.tokenizer.base_codes
         embedding = (found - wanted).abs()[batch.valid].mean()
         loss = weight * embedding + (1 - weight) * tokens

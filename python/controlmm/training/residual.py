@@ -59,6 +59,7 @@ class ResidualRecipe:
         return {"stage": "residual"}
 
     def _losses(self, batch: TokenBatch, layer: Int[Tensor, "B"]) -> dict[str, Tensor]:
+        batch, layer = batch.to(self.model.device), layer.to(self.model.device)
         text = drop_text(batch.text, self.model.config.text_dropout) if self.model.training else batch.text
         logits = self.model(self.model.history(batch.ids, layer), layer, text, batch.valid).float()
         target = batch.ids.gather(2, layer[:, None, None].expand(-1, batch.ids.shape[1], 1)).squeeze(2)

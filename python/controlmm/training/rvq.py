@@ -86,7 +86,7 @@ class RvqRecipe:
 
     def loss(self, batch_size: int) -> dict[str, Tensor]:
         """Losses of a random batch of windows."""
-        target = self._windows.sample(batch_size)
+        target = self._windows.sample(batch_size).to(self.model.device)
         decoded, quantized = self.model(target)
         decoded = decoded.float()
         reconstruction = self._distance(decoded, target)
@@ -112,8 +112,8 @@ class RvqRecipe:
         return {"stage": "rvq", "joint_weight": self.joint_weight, "window": WINDOW}
 
     def _joints(self, features: Float[Tensor, "B T D"]) -> Float[Tensor, "B T J 3"]:
-        skeleton = self.normalizer.skeleton
-        return recover_joints(self.normalizer.denormalize(features), joints=skeleton.num_joints)
+        normalizer = self.normalizer.to(features.device)
+        return recover_joints(normalizer.denormalize(features), joints=normalizer.skeleton.num_joints)
 
 
 def reconstruction_errors(
@@ -126,10 +126,11 @@ def reconstruction_errors(
     layer ``perplexity_0``, ...: how many codes are in use, as e to the entropy of their shares.
     """
     errors, ids = [], []
+    normalizer = normalizer.to(model.device)
     joints = normalizer.skeleton.num_joints
     for clip in clips:
         frames = len(clip.features) // model.config.downsample * model.config.downsample
-        target = clip.features[None, :frames]
+        target = clip.features[None, :frames].to(model.device)
         decoded, quantized = model(normalizer.normalize(target))
         decoded = normalizer.denormalize(decoded.float())
         ids.append(quantized.ids[0])

@@ -87,7 +87,7 @@ class RvqDecoderRecipe:
 
     def loss(self, batch_size: int) -> dict[str, Tensor]:
         """Losses of a random batch of whole clips."""
-        ids, target, frames = self._sample(batch_size)
+        ids, target, frames = (tensor.to(self.model.device) for tensor in self._sample(batch_size))
         decoded = self.model.decode(self.model.quantizer.lookup(ids), frames).float()
         shown, wanted = decoded[frames], target[frames]
         reconstruction = smooth_l1_loss(shown, wanted)
@@ -123,8 +123,8 @@ class RvqDecoderRecipe:
         return pad_sequence(ids, batch_first=True, padding_value=-1), target, frames
 
     def _joints(self, features: Float[Tensor, "B T D"]) -> Float[Tensor, "B T J 3"]:
-        skeleton = self.normalizer.skeleton
-        return recover_joints(self.normalizer.denormalize(features), joints=skeleton.num_joints)
+        normalizer = self.normalizer.to(features.device)
+        return recover_joints(normalizer.denormalize(features), joints=normalizer.skeleton.num_joints)
 
 
 def _build(_: RvqVaeConfig, inputs: StageInputs) -> Recipe:

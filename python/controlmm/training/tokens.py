@@ -34,6 +34,16 @@ class TokenBatch:
     text: Float[Tensor, "B E"]
     captions: list[str]
 
+    def to(self, device: torch.device) -> TokenBatch:
+        """The same batch on another device."""
+        return TokenBatch(
+            self.ids.to(device),
+            self.valid.to(device),
+            self.features.to(device),
+            self.text.to(device),
+            self.captions,
+        )
+
     @property
     def frames(self) -> Bool[Tensor, "B T"]:
         """Frames that belong to each clip."""
