@@ -107,8 +107,8 @@ def _write(
 
 def _page(title: str, facts: dict[str, Any], table: str, notes: list[str]) -> str:
     said = "\n".join(f"- {name}: {value}" for name, value in facts.items())
-    foot = "\n".join(f"- {note}" for note in notes)
-    return f"# {title}\n\n{table}\n\n{foot}\n\n{said}\n"
+    parts = [f"# {title}", table, "\n".join(f"- {note}" for note in notes), said]
+    return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def _confidence(model: Path | None, test_set: TestSet, protocol: Protocol, effort: float, out: Path) -> None:
@@ -137,4 +137,5 @@ def _confidence(model: Path | None, test_set: TestSet, protocol: Protocol, effor
     (out / f"{CONFIDENCE}.md").write_text(text, encoding="utf-8")
     typer.echo(text)
     maps = {record.label: record.by_position for record in records}
-    typer.echo(str(save_confidence(maps, out / f"{CONFIDENCE}.png")))
+    means = {record.label: record.mean for record in records}
+    typer.echo(str(save_confidence(maps, means, out / f"{CONFIDENCE}.png")))

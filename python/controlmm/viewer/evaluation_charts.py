@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import torch
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -34,7 +34,10 @@ def save_tradeoff(groups: Mapping[str, Sequence[Point]], path: Path, *, title: s
             area = max(_SMALLEST, _LARGEST * seconds / slowest)
             color = palette.CONTROL[index % len(palette.CONTROL)]
             axes.scatter(fid, max(error, 1e-3), s=area, color=color, alpha=0.6, edgecolors=palette.INK)
-            axes.annotate(f"{label}\n{seconds:.2g} s", (fid, max(error, 1e-3)), fontsize=7, color=palette.INK)
+            axes.annotate(
+                f"{label}, {seconds:.3g} s", (fid, max(error, 1e-3)), xytext=(7, 5),
+                textcoords="offset points", fontsize=7, color=palette.INK,
+            )  # fmt: skip
         axes.set_yscale("log")
         axes.margins(0.25)
         _label(axes, name, "FID", "average error (cm)")
@@ -57,27 +60,42 @@ def save_curves(
     return _saved(figure, path)
 
 
-def save_confidence(records: Mapping[str, Float[Tensor, "S L"]], path: Path) -> Path:
-    """A map over steps and tokens for each record, and their means over the steps (Figures 7 to 11)."""
-    figure = _figure(len(records) + 1, "Confidence of the tokens drawn in each step")
-    for number, (label, confidence) in enumerate(records.items(), start=1):
-        axes = figure.add_subplot(1, len(records) + 1, number)
-        axes.imshow(
-            confidence.numpy(), aspect="auto", vmin=0, vmax=1, cmap="viridis", interpolation="nearest"
-        )
+def save_confidence(
+    maps: Mapping[str, Float[Tensor, "S L"]], means: Mapping[str, Float[Tensor, "S"]], path: Path
+) -> Path:
+    """A map over steps and tokens for each case, and the means over the steps (ControlMM, Figures 7 to 11).
+
+    Args:
+        maps: Confidence by step and position, from 0 to 1.
+        means: Over all tokens, for the same cases.
+        path: Picture to write.
+    """
+    columns = 3
+    rows = math.ceil((len(maps) + 1) / columns)
+    figure = _figure(columns, "Confidence of the tokens drawn in each step", rows=rows)
+    for number, (label, confidence) in enumerate(maps.items(), start=1):
+        axes = figure.add_subplot(rows, columns, number)
+        steps, tokens = confidence.shape
+        image = axes.imshow(
+            confidence.numpy(), aspect="auto", vmin=0, vmax=1, cmap="viridis", interpolation="nearest",
+            extent=(0.5, tokens + 0.5, steps + 0.5, 0.5),
+        )  # fmt: skip
+        figure.colorbar(image, ax=axes).ax.tick_params(labelsize=6)
         _label(axes, label, "token", "step")
         axes.grid(visible=False)
-    axes = figure.add_subplot(1, len(records) + 1, len(records) + 1)
-    for index, (label, confidence) in enumerate(records.items()):
+    axes = figure.add_subplot(rows, columns, len(maps) + 1)
+    for index, (label, mean) in enumerate(means.items()):
         color = palette.CONTROL[index % len(palette.CONTROL)]
-        axes.plot(torch.arange(1, len(confidence) + 1), confidence.nanmean(1), "o-", color=color, label=label)
-    _label(axes, "mean", "step", "confidence")
-    axes.legend(fontsize=6, frameon=False)
+        axes.plot(range(1, len(mean) + 1), mean.tolist(), "o-", color=color, label=label, markersize=4)
+    _label(axes, "mean over tokens", "step", "confidence")
+    axes.legend(fontsize=7, frameon=False)
     return _saved(figure, path)
 
 
-def _figure(panels: int, title: str) -> Figure:
-    figure = Figure(figsize=(_PANEL[0] * panels, _PANEL[1]), facecolor=palette.PAPER, layout="constrained")
+def _figure(panels: int, title: str, *, rows: int = 1) -> Figure:
+    figure = Figure(
+        figsize=(_PANEL[0] * panels, _PANEL[1] * rows), facecolor=palette.PAPER, layout="constrained"
+    )
     FigureCanvasAgg(figure)
     if title:
         figure.suptitle(title, fontsize=12, fontweight="bold", color=palette.INK, parse_math=False)
