@@ -11,13 +11,16 @@ import torch
 
 from controlmm.data import Caption, Clip, write_folder
 from controlmm.evaluation.control_draws import ControlSetting
-from controlmm.evaluation.evaluators import Evaluator, load_evaluator
+from controlmm.evaluation.evaluators import Evaluator, LearnedEvaluator, load_evaluator
 from controlmm.evaluation.motion_sources import Batch, Generated, Produced, RealMotion, Reconstruction
 from controlmm.evaluation.protocol import Protocol, Row, evaluate_rows
 from controlmm.evaluation.report import ResultPage
-from controlmm.evaluation.test_set import TestSet, read_test_set
+from controlmm.evaluation.test_set import Item, TestSet, read_test_set
 from controlmm.generation.editing import EditingBudget
+from controlmm.models.motion_text_matcher import MatcherConfig, MotionTextMatcher
+from controlmm.motion.skeleton import KIT
 from controlmm.pipelines import ControlMM, Preset
+from controlmm.text.hashing import HashingTextEncoder
 
 QUICK = Preset(EditingBudget(latent_iterations=2), steps=2)
 ROUNDING = 1e-4  # of embeddings and errors when the batch around a clip changes
@@ -149,6 +152,26 @@ def test_packs_are_read_as_they_stand(shared: Path) -> None:
     assert found.sources == {"hdm05": len(found.items)}
     assert len(found.items) > 100
     assert {caption.kind for item in found.items for caption in item.captions} <= set(found.kinds)
+
+
+def test_kit_is_measured_in_metres_and_needs_an_evaluator_of_its_own(
+    evaluator: Evaluator, tmp_path: Path
+) -> None:
+    generator = torch.Generator().manual_seed(0)
+    features = [100 * torch.randn(40, KIT.feature_dim, generator=generator) for _ in range(3)]  # millimetres
+    items = tuple(Item(f"{i}", clip, (Caption("walks"),), "kit") for i, clip in enumerate(features))
+    kit = TestSet(items, "test", ("annotator",))
+    encoder = HashingTextEncoder(64)
+    config = MatcherConfig.tiny().for_data(KIT.feature_dim, encoder.config())
+    judge = LearnedEvaluator(MotionTextMatcher(config), encoder)
+    rows = [Row("real motion", RealMotion(), ControlSetting("all", 5))]
+    (real,) = evaluate_rows(rows, kit, judge, Protocol(), tmp_path, progress=False)
+    assert real["keys"].mean == 5 * 6
+    assert real["average_joint"].mean == 0
+    local = features[0][:, 4:64].unflatten(-1, (20, 3))
+    assert real["penetration"].mean < 0.001 * local.abs().max()
+    with pytest.raises(ValueError, match="The evaluator takes features of width 263, the data has 251"):
+        evaluate_rows(rows, kit, evaluator, Protocol(), tmp_path / "other", progress=False)
 
 
 def test_a_split_without_usable_clips_is_named(walk: object, tmp_path: Path) -> None:
