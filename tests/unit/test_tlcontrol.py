@@ -12,6 +12,8 @@ from controlmm.generation.code_sampling import draw_part_codes
 from controlmm.generation.noise import clip_seeds
 from controlmm.models.part_vq_vae import PartVqVae, PartVqVaeConfig
 from controlmm.models.trajectory_transformer import TrajectoryTransformer, TrajectoryTransformerConfig
+from controlmm.motion.normalizer import Normalizer
+from controlmm.motion.skeleton import KIT
 from controlmm.pipelines import (
     TLCONTROL_PRESETS,
     ControlMM,
@@ -200,6 +202,23 @@ def test_networks_of_the_published_form_always_work_on_their_full_length(publish
     result = published(PROMPT, frames=40, controls=[WRIST], preset=QUICK)
     assert result.latents.shape == (1, 49, 24)
     assert result.best.num_frames == 40
+
+
+def test_kit_has_its_own_partition_joints_and_unit():
+    torch.manual_seed(3)
+    tokenizer = PartVqVae(PartVqVaeConfig.tiny().for_features(251))
+    for part in range(6):
+        tokenizer.quantizer.book(part).codes.normal_()
+    pipeline = TLControl(
+        tokenizer=tokenizer,
+        transformer=TrajectoryTransformer(TrajectoryTransformerConfig.tiny().for_skeleton(KIT)),
+        normalizer=Normalizer(torch.zeros(251), torch.full((251,), 50.0)),
+        text_encoder=HashingTextEncoder(64),
+    )
+    control = JointControl("LW", frames=[3, 12], positions=[[-0.1, 0.6, 0.1], [-0.1, 0.7, 0.2]])
+    result = pipeline(PROMPT, frames=24, controls=[control], preset=QUICK)
+    assert result.best.joints.shape == (24, 21, 3)
+    assert torch.isfinite(result.best.joints).all()
 
 
 def test_networks_of_different_forms_do_not_fit(tiny_tlcontrol, published):
