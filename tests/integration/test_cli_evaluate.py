@@ -7,6 +7,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
+
+from controlmm.cli.interruption import INTERRUPTED
+from controlmm.cli.main import app
 
 
 @pytest.fixture
@@ -58,6 +62,20 @@ def test_both_systems_are_measured_on_the_same_clips_and_targets(
     ]
     assert len({row["metrics"]["keys"]["mean"] for row in rows}) == 1
     assert "| tlcontrol, perplexity of " in printed
+
+
+def test_ctrl_c_says_how_to_go_on(
+    arguments: list[object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("controlmm.evaluation.motion_sources.Generated.motions", stopped)
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert result.exit_code == INTERRUPTED
+    said = f"Stopped. The same command goes on in {tmp_path / 'out'}; at most one batch is lost."
+    assert said in result.stderr
+    assert len(list((tmp_path / "out").rglob("*.safetensors"))) == 2  # real motion and reconstruction
 
 
 def test_two_models_need_two_names(

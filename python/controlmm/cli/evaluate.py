@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from controlmm.cli.interruption import resumable
+
 if TYPE_CHECKING:
     from controlmm.evaluation.control_draws import ControlSetting
     from controlmm.evaluation.protocol import Protocol, Row
@@ -68,7 +70,8 @@ def evaluate(
     setting.check(test_set.skeleton)
     pipelines = _pipelines(model or [])
     rows = _rows(pipelines, preset or ["balanced"], setting)
-    scores = evaluate_rows(rows, test_set, judge, protocol, out, progress=not quiet)
+    with resumable(out):
+        scores = evaluate_rows(rows, test_set, judge, protocol, out, progress=not quiet)
     clips = [item.features for item in test_set.items[: protocol.clips(len(test_set.items))]]
     codes = {name: code_statistics(pipeline.decoder, clips) for name, pipeline in pipelines.items()}
     facts = facts_of(test_set, protocol, seconds=time.perf_counter() - started)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from controlmm.cli.evaluate import KINDS, facts_of, listed
+from controlmm.cli.interruption import resumable
 
 if TYPE_CHECKING:
     from controlmm.evaluation.protocol import Protocol
@@ -63,7 +64,8 @@ def reproduce(
     plan = _plan(table, model, tlcontrol, effort, tuple(preset or ()))
     judge = load_evaluator(evaluator)
     test_set = read_test_set(data, kinds=listed(captions))
-    scores = evaluate_rows(plan.rows, test_set, judge, protocol, out / table, progress=not quiet)
+    with resumable(out / table):
+        scores = evaluate_rows(plan.rows, test_set, judge, protocol, out / table, progress=not quiet)
     facts = facts_of(test_set, protocol, seconds=time.perf_counter() - started)
     facts["editing iterations"] = "the paper's" if effort == 1 else f"{effort:g} of the paper's"
     _write(plan, scores, facts, judge.caution, out / table)
