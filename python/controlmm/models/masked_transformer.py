@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from controlmm.nn.checkpoint import PretrainedModel
+from controlmm.nn.dropout import Dropout
 from controlmm.nn.trunk import (
     encoder_layers,
     initialize_weights,
@@ -90,7 +91,7 @@ class MaskedTransformer(PretrainedModel):
         self.token_embedding = nn.Embedding(config.codebook_size + 2, config.token_dim)
         self.token_proj = nn.Linear(config.token_dim, config.width)
         self.text_proj = nn.Linear(config.text_dim, config.width)
-        self.dropout = nn.Dropout(config.dropout)
+        self.dropout = Dropout(config.dropout)
         self.layers = encoder_layers(
             config.layers,
             width=config.width,

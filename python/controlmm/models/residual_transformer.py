@@ -12,6 +12,7 @@ from torch.nn.functional import one_hot
 
 from controlmm.models.masked_transformer import with_text_token
 from controlmm.nn.checkpoint import PretrainedModel
+from controlmm.nn.dropout import Dropout
 from controlmm.nn.trunk import (
     encoder_layers,
     initialize_weights,
@@ -109,7 +110,7 @@ class ResidualTransformer(PretrainedModel):
         self.token_proj = nn.Linear(config.token_dim, config.width)
         self.text_proj = nn.Linear(config.text_dim, config.width)
         self.layer_proj = nn.Linear(config.num_quantizers, config.width)
-        self.dropout = nn.Dropout(config.dropout)
+        self.dropout = Dropout(config.dropout)
         self.layers = encoder_layers(
             config.layers,
             width=config.width,

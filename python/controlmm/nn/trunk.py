@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from controlmm.nn.dropout import Dropout
+
 _WEIGHT_STD = 0.02
 
 
@@ -16,12 +18,15 @@ def encoder_layers(
     count: int, *, width: int, heads: int, feedforward: int, dropout: float, activation: str = "gelu"
 ) -> nn.ModuleList:
     """``count`` standard post-norm encoder layers with exact GELU (or ``activation="relu"``)."""
-    return nn.ModuleList(
+    layers = nn.ModuleList(
         nn.TransformerEncoderLayer(
             width, heads, feedforward, dropout, activation=activation, layer_norm_eps=1e-5, batch_first=True
         )
         for _ in range(count)
     )
+    for layer in layers:
+        layer.dropout, layer.dropout1, layer.dropout2 = (Dropout(dropout) for _ in range(3))
+    return layers
 
 
 def run_layers(
