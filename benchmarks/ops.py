@@ -1,6 +1,6 @@
 """Operators against eager torch, interleaved: ``python -m benchmarks.ops [--quick] [--json FILE]``.
 
-Ratios are medians of one run; absolute times move with the load of the machine, ratios much less.
+Ratios are those of medians of one run; absolute times move with the load of the machine, ratios much less.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 import timeit
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +18,13 @@ from benchmarks import cases
 from benchmarks.timing import copy_bandwidth, interleaved
 from controlmm import _core, ops
 
+OURS = ("raw", "public")
+
 
 def _parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "--quick", action="store_true", help="B = 1 and 32, F = 196, one thread, fewer rounds"
-    )
-    parser.add_argument("--rounds", type=int, default=None, help="rounds of each measurement")
+    parser.add_argument("--quick", action="store_true", help="B = 1 and 32, F = 196, one thread")
+    parser.add_argument("--rounds", type=int, default=15, help="rounds of each measurement")
     parser.add_argument("--json", type=Path, default=None, help="write all figures to this file")
     return parser.parse_args()
 
@@ -34,77 +35,87 @@ def binding_microseconds() -> float:
     calls = 200_000
     seconds = min(
         timeit.repeat(
-            lambda: _core.recover_joints_backward(features, joints, features, 1), number=calls, repeat=3
+            lambda: _core.recover_joints_backward(features, joints, features, 1), number=calls, repeat=5
         )
     )
     return seconds / calls * 1e6
 
 
 def _workloads(batch: int, frames: int, threads: int) -> list[cases.Workload]:
-    loads = cases.kinematics(batch, frames, threads)
-    loads.append(cases.guidance(batch, frames, obstacles=False))
-    if frames == 196 and batch <= 32:
-        loads.append(cases.guidance(batch, frames, obstacles=True))
-    return loads
+    return [
+        *cases.kinematics(batch, frames, threads),
+        cases.guidance(batch, frames, threads, obstacles=False),
+        cases.guidance(batch, frames, threads, obstacles=True),
+        *cases.losses(batch, frames),
+    ]
 
 
-def _measure(
+def _measured(
     workload: cases.Workload, *, rounds: int, is_cold: bool, bandwidth: float, **where: int
 ) -> dict[str, Any]:
     times = interleaved(workload.contenders, rounds=rounds, is_cold=is_cold)
-    native = times["native"]
     row: dict[str, Any] = {"workload": workload.name, **where, "cache": "cold" if is_cold else "hot"}
-    row["native_us"] = native * 1e6
-    row["ratios"] = {name: seconds / native for name, seconds in times.items() if name != "native"}
+    row["microseconds"] = {name: seconds * 1e6 for name, seconds in times.items()}
+    row["ratios"] = {
+        ours: {name: seconds / times[ours] for name, seconds in times.items() if name not in OURS}
+        for ours in OURS
+        if ours in times
+    }
     if workload.bytes_moved:
-        row["share_of_copy_bandwidth"] = workload.bytes_moved / native / bandwidth
+        row["share_of_copy_bandwidth"] = workload.bytes_moved / times["raw"] / bandwidth
     return row
 
 
-def _print(row: dict[str, Any]) -> None:
-    ratios = "  ".join(f"{name} {ratio:6.1f}x" for name, ratio in row["ratios"].items())
-    share = row.get("share_of_copy_bandwidth")
+def _line(row: dict[str, Any]) -> str:
     place = f"B={row['batch']:<4} F={row['frames']:<4} {row['threads']} thr {row['cache']:<4}"
-    bandwidth = "" if share is None else f"  {share:.2f} of copy"
-    print(f"{row['workload']:<52} {place} {row['native_us']:10.1f} us  {ratios}{bandwidth}", flush=True)
+    parts = []
+    for ours, ratios in row["ratios"].items():
+        against = ", ".join(f"{name} {ratio:.1f}x" for name, ratio in ratios.items())
+        parts.append(f"{ours} {row['microseconds'][ours]:.1f} us ({against})")
+    share = row.get("share_of_copy_bandwidth")
+    parts.append("" if share is None else f"{share:.2f} of copy")
+    return f"{row['workload']:<56} {place}  " + "  ".join(parts)
+
+
+def _all_rows(*, is_quick: bool, rounds: int, bandwidths: dict[int, float]) -> Iterator[dict[str, Any]]:
+    for threads, bandwidth in bandwidths.items():
+        torch.set_num_threads(threads)
+        for batch in (1, 32) if is_quick else (1, 32, 256):
+            fewer = max(3, rounds // (1 + batch // 64))
+            for frames in (196,) if is_quick else (60, 196):
+                where = {"batch": batch, "frames": frames, "threads": threads}
+                for workload in _workloads(batch, frames, threads):
+                    for is_cold in (False, True):
+                        yield _measured(workload, rounds=fewer, is_cold=is_cold, bandwidth=bandwidth, **where)
+        for tokens in (49, 1568):
+            where = {"batch": tokens // 49, "frames": 196, "threads": threads}
+            for workload in cases.gumbel(tokens, threads):
+                yield _measured(workload, rounds=rounds, is_cold=False, bandwidth=bandwidth, **where)
 
 
 def main() -> None:
     arguments = _parse()
-    rounds = arguments.rounds or (7 if arguments.quick else 15)
-    torch.set_num_threads(1)
-    bandwidth = copy_bandwidth()
-    binding = binding_microseconds()
-    print(ops.build_info())
-    print(
-        f"copy bandwidth {bandwidth / 1e9:.1f} GB/s (read + write), three tensors into C++ {binding:.2f} us"
-    )
-    rows = []
+    bandwidths = {}
     for threads in (1,) if arguments.quick else (1, 2):
         torch.set_num_threads(threads)
-        for batch in (1, 32) if arguments.quick else (1, 32, 256):
-            for frames in (196,) if arguments.quick else (60, 196):
-                for workload in _workloads(batch, frames, threads):
-                    for is_cold in (False, True):
-                        row = _measure(
-                            workload,
-                            rounds=max(3, rounds // (1 + batch // 64)),
-                            is_cold=is_cold,
-                            bandwidth=bandwidth,
-                            batch=batch,
-                            frames=frames,
-                            threads=threads,
-                        )
-                        _print(row)
-                        rows.append(row)
-        for tokens in (49, 1568):
-            for workload in cases.gumbel(tokens):
-                where = {"batch": 1, "frames": tokens, "threads": threads}
-                row = _measure(workload, rounds=rounds, is_cold=False, bandwidth=bandwidth, **where)
-                _print(row)
-                rows.append(row)
+        bandwidths[threads] = copy_bandwidth()
+    torch.set_num_threads(1)
+    binding = binding_microseconds()
+    print(ops.build_info())
+    for threads, bandwidth in bandwidths.items():
+        print(f"copy bandwidth with {threads} threads: {bandwidth / 1e9:.1f} GB/s (read + write)")
+    print(f"three tensors into C++: {binding:.2f} us", flush=True)
+    rows = []
+    for row in _all_rows(is_quick=arguments.quick, rounds=arguments.rounds, bandwidths=bandwidths):
+        print(_line(row), flush=True)
+        rows.append(row)
     if arguments.json:
-        info = {"build": str(ops.build_info()), "copy_bytes_per_second": bandwidth, "binding_us": binding}
+        info = {
+            "build": str(ops.build_info()),
+            "instruction_set": ops.active_isa(),
+            "copy_bytes_per_second": bandwidths,
+            "binding_us": binding,
+        }
         arguments.json.write_text(json.dumps({**info, "rows": rows}, indent=2))
 
 
