@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import time
 import timeit
 from collections.abc import Iterator
 from pathlib import Path
@@ -35,7 +36,10 @@ def binding_microseconds() -> float:
     calls = 200_000
     seconds = min(
         timeit.repeat(
-            lambda: _core.recover_joints_backward(features, joints, features, 1), number=calls, repeat=5
+            lambda: _core.recover_joints_backward(features, joints, features, 1),
+            timer=time.thread_time,
+            number=calls,
+            repeat=5,
         )
     )
     return seconds / calls * 1e6
