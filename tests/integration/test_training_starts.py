@@ -73,6 +73,21 @@ def test_a_refined_decoder_of_other_codes_is_refused(model, tiny_data_folder, tm
         load_tokenizer(tmp_path)
 
 
+def test_a_decoder_is_not_refined_for_other_codes_than_the_roots(model, tiny_data_folder, tmp_path):
+    train("rvq", tiny_data_folder, tmp_path)
+    with pytest.raises(
+        ValueError, match=r"tokenizer has other codes than .*rvq; a decoder can only be refined"
+    ):
+        train("rvq-decoder", tiny_data_folder, tmp_path, start_from=model)
+    assert not (tmp_path / "rvq-decoder").exists()
+
+
+def test_a_model_of_the_other_system_lends_nothing(model, tiny_data_folder, tmp_path):
+    with pytest.raises(ValueError, match=r"holds a pipeline of kind 'controlmm'.*expected 'tlcontrol'"):
+        train("tl-mtt", tiny_data_folder, tmp_path / "root", start_from=model)
+    assert not (tmp_path / "root").exists()
+
+
 def test_a_model_lends_its_earlier_stages_and_its_weights(model, tiny_data_folder, tmp_path):
     train("masked", tiny_data_folder, tmp_path, start_from=model, learning_rate=UNTRAINED)
     started = load_file(tmp_path / "masked" / "best" / "model.safetensors")

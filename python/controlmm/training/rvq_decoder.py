@@ -25,7 +25,14 @@ from controlmm.training.recipe import Recipe
 from controlmm.training.rvq import POSITION_WEIGHT, reconstruction_errors
 from controlmm.training.samples import rebuilt_clips
 from controlmm.training.settings import TrainingSettings
-from controlmm.training.stage import NORMALIZER_FILE, Stage, StageInputs, best_weights, by_size
+from controlmm.training.stage import (
+    NORMALIZER_FILE,
+    Stage,
+    StageInputs,
+    best_weights,
+    by_size,
+    have_same_codes,
+)
 from controlmm.training.tokens import near_lengths, tokenize
 from controlmm.training.windows import source_weights
 
@@ -129,6 +136,14 @@ class RvqDecoderRecipe:
 
 def _build(_: RvqVaeConfig, inputs: StageInputs) -> Recipe:
     model = RvqVae.from_pretrained(best_weights(inputs.root, "rvq"))
+    if inputs.start is not None:
+        given = RvqVae.from_pretrained(inputs.start)
+        if not have_same_codes(given, model):
+            raise ValueError(
+                f"{inputs.start} has other codes than {inputs.root / 'rvq'}; a decoder can only be refined "
+                "for the codes that tokens are made with. Choose another --out."
+            )
+        model = given
     normalizer = Normalizer.load(inputs.root / NORMALIZER_FILE)
     return RvqDecoderRecipe(model, normalizer, inputs.train_clips, inputs.val_clips, progress=inputs.progress)
 

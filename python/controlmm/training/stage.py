@@ -38,6 +38,7 @@ class StageInputs:
     options: Any = None  # the stage's own, see `Stage.options`
     augmentation: Augmentation = field(default_factory=Augmentation)
     progress: bool = True
+    start: Path | None = None  # folder of the weights that the network starts from
     writes: bool = True  # whether this process may write into the root; one of those that train together may
 
     @cached_property
@@ -95,6 +96,7 @@ class Stage:
     configs: Mapping[str, Any]  # network configuration by size
     settings: Mapping[str, TrainingSettings]  # by size
     needs: tuple[str, ...] = ()  # stages that must be trained before, in the same root
+    system: str = field(default="controlmm", kw_only=True)  # the kind of whole model that it is a part of
     network: str | None = field(default=None, kw_only=True)  # its folder in the folder of a whole model
     uses_text: bool = field(default=True, kw_only=True)
     options: Any = field(default=None, kw_only=True)  # a frozen dataclass: the recipe's own, with defaults
@@ -151,12 +153,17 @@ def load_tokenizer(root: str | Path) -> tuple[RvqVae, Normalizer]:
     if tokenizer_stage(root) == "rvq":
         return tokenizer, normalizer
     refined = RvqVae.from_pretrained(best_weights(root, "rvq-decoder"))
-    if refined.config != tokenizer.config or not torch.equal(refined.base_codes, tokenizer.base_codes):
+    if not have_same_codes(refined, tokenizer):
         raise ValueError(
             f"{root / 'rvq-decoder'} refines another tokenizer than {root / 'rvq'}. "
             "Remove it, or train it again."
         )
     return refined, normalizer
+
+
+def have_same_codes(first: RvqVae, second: RvqVae) -> bool:
+    """Whether a token means the same to both tokenizers."""
+    return first.config == second.config and torch.equal(first.base_codes, second.base_codes)
 
 
 def tokenizer_stage(root: Path) -> str:

@@ -92,12 +92,13 @@ def train_stage(
         options=parts["options"],
         augmentation=parts["data"],
         progress=progress,
+        start=start,
         writes=team.is_first,
     )
     with team.first_goes_ahead():
         if start_from is not None and team.is_first:
             adopt_earlier_stages(Path(start_from), root, stage)
-        recipe, built_on = _built(stage, parts["config"], settings.seed, inputs, start)
+        recipe, built_on = _built(stage, parts["config"], settings.seed, inputs)
     about: dict[str, Any] = {"size": size, "built_on": built_on, **data_identity(inputs.splits)}
     if options:
         about["options"] = dict(options)
@@ -120,19 +121,17 @@ def train_stage(
     return root / name
 
 
-def _built(
-    stage: Stage, config: Any, seed: int, inputs: StageInputs, start: Path | None
-) -> tuple[Recipe, dict[str, str]]:
+def _built(stage: Stage, config: Any, seed: int, inputs: StageInputs) -> tuple[Recipe, dict[str, str]]:
     """The stage's recipe, and the hashes of the weights that it stands on."""
     folders = {need: best_weights(inputs.root, need) for need in stage.needs}
-    if start is not None:
-        folders["start_from"] = start
+    if inputs.start is not None:
+        folders["start_from"] = inputs.start
     if stage.uses_text and inputs.text_encoder is None:
         raise ValueError(f"`text_encoder` is needed to train {stage.name!r}.")
     torch.manual_seed(seed)  # fresh weights are a function of the seed
     recipe = stage.build(config, inputs)
-    if start is not None:
-        load_starting_weights(recipe.model, start)
+    if inputs.start is not None:
+        load_starting_weights(recipe.model, inputs.start)
     return recipe, {name: file_hash(folder / WEIGHTS_FILE) for name, folder in folders.items()}
 
 

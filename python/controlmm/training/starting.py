@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from controlmm.nn.checkpoint import CONFIG_FILE, WEIGHTS_FILE, PretrainedModel, read_weights
-from controlmm.pipelines.folder import PIPELINE_FILE, TEXT_ENCODER_FILE, read_json
+from controlmm.pipelines.folder import PIPELINE_FILE, TEXT_ENCODER_FILE, check_kind, read_json
 from controlmm.text import check_same_encoder
 from controlmm.training.registry import load_stage
 from controlmm.training.run_folder import SETTINGS_FILE
@@ -24,13 +24,15 @@ def starting_folder(path: Path, stage: Stage) -> Path:
 
     Raises:
         FileNotFoundError: If there are no such weights.
-        ValueError: If the stage cannot start from weights alone.
+        ValueError: If the stage cannot start from weights alone, or the whole model is of another system.
     """
     if stage.network is None or not stage.starts_from_weights:
         raise ValueError(
             f"Stage {stage.name!r} cannot start from given weights: its training needs more than a model "
             "folder keeps. Train it from the beginning."
         )
+    if (path / PIPELINE_FILE).is_file():
+        check_kind(path, stage.system)
     for folder in (path, path / stage.network):
         if (folder / CONFIG_FILE).is_file() and (folder / WEIGHTS_FILE).is_file():
             return folder

@@ -211,6 +211,7 @@ STAGE = Stage(
     by_size(TrajectoryTransformerConfig),
     SETTINGS,
     ("tl-vq",),
+    system="tlcontrol",
     network="transformer",
     options=TrajectoryOptions(),
 )

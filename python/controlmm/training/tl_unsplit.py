@@ -10,6 +10,7 @@ STAGE = Stage(
     tl_vq.STAGE.build,
     {size: config.unsplit() for size, config in tl_vq.STAGE.configs.items()},
     tl_vq.SETTINGS,
+    system="tlcontrol",
     uses_text=False,
     starts_from_weights=False,
 )

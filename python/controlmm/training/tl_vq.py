@@ -118,6 +118,7 @@ STAGE = Stage(
     _build,
     by_size(PartVqVaeConfig),
     SETTINGS,
+    system="tlcontrol",
     network="tokenizer",
     uses_text=False,
     starts_from_weights=False,
