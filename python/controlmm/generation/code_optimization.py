@@ -26,7 +26,6 @@ FootForm = Literal["contact", "published", "none"]
 FOOT_FORMS = ("contact", "published", "none")
 PAPER_ITERATIONS = 1000
 _EVALUATIONS_A_STEP = 1.25  # at most, on average: what the released code's L-BFGS may spend
-_METRE = {"m": 1.0, "mm": 1000.0}  # in a skeleton's unit
 
 
 @dataclass(frozen=True)
@@ -104,7 +103,7 @@ def optimize_codes(
         ),
         rate=settings.rate,
         history=settings.history,
-        tolerance=LbfgsTolerance(change=settings.tolerance * _METRE[decoder.normalizer.skeleton.unit] ** 2),
+        tolerance=LbfgsTolerance(change=settings.tolerance / decoder.normalizer.skeleton.metres**2),
         progress=progress,
     )
     return dataclasses.replace(solution, latents=solution.latents * unit)

@@ -17,7 +17,7 @@ from controlmm.motion.layout import feature_layout
 from controlmm.motion.skeleton import Skeleton
 
 _IS_CONTACT = 0.5  # of a contact channel, which is 1 at rest and 0 in motion
-_PUBLISHED_HEIGHT = {"m": 0.02, "mm": 20.0}  # ankle and toe on average lower: the released code plants a foot
+_PUBLISHED_HEIGHT = 0.02  # metres: ankle and toe on average lower: the released code plants a foot
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,8 +99,8 @@ class PublishedFootTerm:
         return replace(self, frames=self.frames[clips])
 
     def _loss(self, feet: Float[Tensor, "B T 2 3"]) -> Float[Tensor, "B T"]:
-        is_up = feet[..., 1].mean(2) > _PUBLISHED_HEIGHT[self.skeleton.unit]
-        at = torch.arange(feet.shape[1]).expand(is_up.shape)
+        is_up = feet[..., 1].mean(2) > _PUBLISHED_HEIGHT / self.skeleton.metres
+        at = torch.arange(feet.shape[1], device=feet.device).expand(is_up.shape)
         last_up = torch.where(is_up, at, 0).cummax(1).values  # frame 0 until a foot has been in the air
         remembered = feet.gather(1, last_up[..., None, None].expand(feet.shape))
         held = remembered * feet.new_tensor([1.0, 0.0, 1.0])

@@ -195,7 +195,7 @@ class TrajectoryTransformer(PretrainedModel):
         tokens = self.bundle_proj(bundles).flatten(1, 2)
         sequence = torch.cat([text_token, tokens], dim=1)
         sequence = self.dropout(sequence + self.positions[: sequence.shape[1]])
-        everything = torch.ones(sequence.shape[:2], dtype=torch.bool)
+        everything = sequence.new_ones(sequence.shape[:2], dtype=torch.bool)
         hidden = run_layers(self.layers, sequence, everything)
         hidden = run_layers(self.head_layers, self.to_head(hidden), everything)
         by_part: Tensor = hidden[:, 1:].unflatten(1, bundles.shape[1:3])

@@ -24,7 +24,7 @@ class PartQuantizer(Quantizer):
 
     def forward(self, x: Float[Tensor, "B L QC"], valid: Bool[Tensor, "B L"] | None = None) -> Quantized:
         """Each slice's nearest code, straight-through; in training the codebooks follow (EMA)."""
-        keep = torch.ones(x.shape[:2], dtype=torch.bool) if valid is None else valid
+        keep = x.new_ones(x.shape[:2], dtype=torch.bool) if valid is None else valid
         slices = x.float().chunk(len(self.books), dim=-1)
         parts = [self._quantize(self.book(part), piece, keep) for part, piece in enumerate(slices)]
         ids = torch.stack([chosen for chosen, _ in parts], dim=-1)

@@ -105,12 +105,12 @@ class TrajectoryRecipe:
         return {"stage": "tl-mtt", "masking": self.masking, "curriculum": self.curriculum}
 
     def _losses(self, batch: TokenBatch) -> dict[str, Tensor]:
-        batch = self._padded(batch) if self.is_published else batch
+        batch = self._placed(batch)
         progress = min(1.0, self.model.batches_seen.item() / self.curriculum)
         parts = self.model.config.num_parts
-        given = given_coordinates(self.masking, batch.frames, joints=parts, progress=progress)
+        given = given_coordinates(self.masking, batch.frames.cpu(), joints=parts, progress=progress)
         text = drop_text(batch.text, self.model.config.text_dropout) if self.model.training else batch.text
-        logits = self._logits(batch, given, text)
+        logits = self._logits(batch, given.to(self.model.device), text)
         codes = _clip_cross_entropy(logits, batch.ids)
         latents = draw_codes(logits, self.tokenizer.quantizer, seed=int(torch.randint(2**62, ())))
         reconstruction = self._reconstruction(latents, batch)
@@ -125,7 +125,7 @@ class TrajectoryRecipe:
 
     def _logits(self, batch: TokenBatch, given: Tensor, text: Tensor) -> Float[Tensor, "B L P K"]:
         targets = self._joints(batch.features)
-        mask = torch.zeros(targets.shape, dtype=torch.bool)
+        mask = torch.zeros_like(targets, dtype=torch.bool)
         mask[:, :, list(self.model.config.joints)] = given
         trajectories, given = self.model.trajectories(targets, mask)
         logits: Tensor = self.model(trajectories, given, text, batch.valid)
@@ -138,7 +138,7 @@ class TrajectoryRecipe:
         return smooth_l1_loss(decoded[batch.frames], batch.features[batch.frames])
 
     def _feedforward_error(self, batch: TokenBatch) -> Tensor:
-        batch = self._padded(batch) if self.is_published else batch
+        batch = self._placed(batch)
         given = batch.frames[:, :, None, None].expand(-1, -1, self.model.config.num_parts, 3)
         ids = self._logits(batch, given, batch.text).argmax(-1)
         frames = None if self.is_published else batch.frames
@@ -146,6 +146,12 @@ class TrajectoryRecipe:
         distance = (self._joints(decoded) - self._joints(batch.features)).norm(dim=-1)
         steered: Tensor = distance[:, :, list(self.model.config.joints)]
         return steered[batch.frames].mean()
+
+    def _placed(self, batch: TokenBatch) -> TokenBatch:
+        """The batch where the network is, in the form that the network sees."""
+        self.tokenizer.to(self.model.device)
+        batch = batch.to(self.model.device)
+        return self._padded(batch) if self.is_published else batch
 
     def _padded(self, batch: TokenBatch) -> TokenBatch:
         """The batch as the published networks see it: zeros up to the longest length, codes of all of it."""
@@ -159,8 +165,8 @@ class TrajectoryRecipe:
         return dataclasses.replace(batch, ids=ids, valid=valid, features=features)
 
     def _joints(self, features: Float[Tensor, "B T D"]) -> Float[Tensor, "B T J 3"]:
-        skeleton = self.normalizer.skeleton
-        return recover_joints(self.normalizer.denormalize(features), joints=skeleton.num_joints)
+        normalizer = self.normalizer.to(features.device)
+        return recover_joints(normalizer.denormalize(features), joints=normalizer.skeleton.num_joints)
 
 
 def draw_codes(

@@ -73,7 +73,7 @@ class PartVqRecipe:
 
     def loss(self, batch_size: int) -> dict[str, Tensor]:
         """Losses of a random batch."""
-        target = self._samples.sample(batch_size)
+        target = self._samples.sample(batch_size).to(self.model.device)
         decoded, quantized = self.model(target)
         decoded = decoded.float()
         losses = self._published(decoded, target) if self.is_published else self._ours(decoded, target)
@@ -103,8 +103,8 @@ class PartVqRecipe:
         return {"loss": loss, "reconstruction": reconstruction, "positions": positions, "joints": joints}
 
     def _joints(self, features: Float[Tensor, "B T D"]) -> Float[Tensor, "B T J 3"]:
-        skeleton = self.normalizer.skeleton
-        return recover_joints(self.normalizer.denormalize(features), joints=skeleton.num_joints)
+        normalizer = self.normalizer.to(features.device)
+        return recover_joints(normalizer.denormalize(features), joints=normalizer.skeleton.num_joints)
 
 
 def _build(config: PartVqVaeConfig, inputs: StageInputs) -> Recipe:
