@@ -51,6 +51,10 @@ class ControlResiduals:
         targets: (B, T, J, 3) metres.
         mask: (B, T, J, 3), the controlled coordinates.
         frames: (B, T), the frames of each clip.
+        joints: Which joints are decoded; by default those that some clip controls.
+        prefix: Latents of motions whose first ``prefix_frames`` frames are kept whatever is tried: features
+            there count as constant, although tokens behind them would change them a little.
+        prefix_frames: See ``prefix``.
     """
 
     def __init__(
@@ -61,12 +65,18 @@ class ControlResiduals:
         frames: Bool[Tensor, "B T"],
         *,
         joints: Sequence[int] | None = None,
+        prefix: Float[Tensor, "B L C"] | None = None,
+        prefix_frames: int = 0,
     ) -> None:
         self.decoder, self._targets, self._mask, self._frames = decoder, targets, mask, frames
         self.part = PartialDecoder(decoder, joints or controlled_joints(mask), frames)
         wanted = list(self.part.joints)
         self._wanted, self._controlled = targets[:, :, wanted], mask[:, :, wanted]
         self._lengths: list[int] = frames.sum(1).tolist()
+        self._prefix = prefix
+        self._held: Tensor | None = None
+        if prefix is not None:
+            self._held = self.part.decode(prefix).features[:, :prefix_frames]
 
     def select(self, clips: Int[Tensor, "S"]) -> ControlResiduals:
         """The same for some of the clips."""
@@ -76,6 +86,8 @@ class ControlResiduals:
             self._mask[clips],
             self._frames[clips],
             joints=self.part.joints,
+            prefix=None if self._prefix is None else self._prefix[clips],
+            prefix_frames=0 if self._held is None else self._held.shape[1],
         )
 
     @torch.enable_grad()
@@ -84,7 +96,10 @@ class ControlResiduals:
         part = self.part
         self._decoded = part.decode(latents.detach())
         self._features = self._decoded.features.requires_grad_()
-        features = self._features * part.std + part.mean
+        features = self._features
+        if self._held is not None:
+            features = torch.cat([self._held, features[:, self._held.shape[1] :]], dim=1)
+        features = features * part.std + part.mean
         self._joints = recover_joints(features, joints=len(part.joints))
         joints, difference = self._joints.detach(), self._joints.detach() - self._wanted
         return [

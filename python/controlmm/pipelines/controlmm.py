@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from controlmm.controls import Control
 from controlmm.generation.latent_editing import edit_latents
 from controlmm.generation.masked_decoding import (
     DecodingRequest,
@@ -35,11 +36,12 @@ from controlmm.motion.motion import Motion
 from controlmm.motion.normalizer import Normalizer
 from controlmm.nn.checkpoint import PretrainedModel
 from controlmm.pipelines import folder as files
+from controlmm.pipelines.adjusting import adjusted
 from controlmm.pipelines.checks import check_masks_end, check_sizes
 from controlmm.pipelines.motion_editing import run_edit
 from controlmm.pipelines.output import GenerationResult
 from controlmm.pipelines.pipeline import MotionPipeline
-from controlmm.pipelines.presets import Preset, resolve_preset
+from controlmm.pipelines.presets import Preset, resolve_preset, with_limits
 from controlmm.text import TextEncoder, check_same_encoder, load_text_encoder
 
 
@@ -187,6 +189,43 @@ class ControlMM(MotionPipeline[Preset]):
             seed=seed,
             progress=progress,
         )
+
+    @torch.no_grad()
+    def adjust(
+        self,
+        result: GenerationResult,
+        controls: Sequence[Control],
+        *,
+        hold_frames: int = 0,
+        tolerance: float = 0.003,
+    ) -> GenerationResult:
+        """Move the targets of a result and solve again from where it stands: for dragging a target about.
+
+        No network but the decoder runs, and motions change least, so that what the new targets leave alone
+        stays. Targets are met to ``tolerance`` or as well as 40 steps can.
+
+        Args:
+            result: What a call or an earlier :meth:`adjust` returned.
+            controls: All targets that hold now, in the world of ``result``.
+            hold_frames: The first frames stay as they are, to the bit.
+            tolerance: Metres.
+
+        Returns:
+            The same motions, adjusted; the world's origin is that of ``result``.
+
+        Raises:
+            TypeError: If ``result`` is none.
+            ValueError: If an argument is unusable; nothing has run then.
+        """
+        return adjusted(self.decoder, result, controls, hold_frames=hold_frames, tolerance=tolerance)
+
+    def wants_exact(self, plan: Preset) -> bool:
+        """See :class:`MotionPipeline`."""
+        return plan.is_exact
+
+    def limited(self, plan: Preset, tolerance: str | float | None, time_budget: str | float | None) -> Preset:
+        """See :class:`MotionPipeline`."""
+        return with_limits(plan, tolerance=tolerance, time_budget=time_budget)
 
     @property
     def longest(self) -> int:

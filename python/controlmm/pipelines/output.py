@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from controlmm.generation.exact import ExactReport
 from controlmm.motion.motion import Motion
 
 FREE = 1e-3  # metres; a joint that enters less deeply counts as clear
@@ -24,6 +25,7 @@ class GenerationResult:
         penetration: (S,) greatest depth to which a joint enters an obstacle in metres, measured likewise.
         latents: (S, L, C) code-space latents that decode to the motions, before they were stood on the floor.
         seconds_taken: Wall-clock seconds of the call.
+        exact: What the exact mode did to each sample; empty without it.
     """
 
     motions: tuple[Motion, ...]
@@ -31,6 +33,7 @@ class GenerationResult:
     penetration: Float[Tensor, "S"]
     latents: Float[Tensor, "S L C"]
     seconds_taken: float
+    exact: tuple[ExactReport, ...] = ()
 
     @property
     def best(self) -> Motion:

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controlmm.controls import Avoid, Control, Objective, Obstacle, TimelineEntry
+from controlmm.generation.exact import ExactReport, meet_exactly
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.noise import clip_seeds
 from controlmm.generation.solvers import Progress
@@ -26,6 +27,7 @@ from controlmm.pipelines.chaining import run_chain
 from controlmm.pipelines.checks import check_sampling
 from controlmm.pipelines.length import draw_frames
 from controlmm.pipelines.output import GenerationResult
+from controlmm.pipelines.reach import check_reach
 from controlmm.pipelines.scene import Scene
 from controlmm.pipelines.timeline import run_timeline
 from controlmm.text import TextEncoder, check_prompt
@@ -91,6 +93,8 @@ class MotionPipeline(ABC, Generic[_Plan]):
         samples: int = 1,
         preset: str | _Plan = "balanced",
         guidance_scale: float | None = None,
+        tolerance: str | float | None = None,
+        time_budget: str | float | None = None,
         seed: int = 0,
         progress: Progress | None = None,
     ) -> GenerationResult:
@@ -113,6 +117,10 @@ class MotionPipeline(ABC, Generic[_Plan]):
             preset: ``fast``, ``balanced``, ``accurate``, one of the papers' (``paper-accurate``), or a preset
                 of one's own.
             guidance_scale: How strongly the text counts; ``None`` takes the preset's.
+            tolerance: Control error at which editing is done, in metres or as ``"1mm"``; ``None`` takes the
+                preset's.
+            time_budget: Time for the editing of latents, in seconds or as ``"200ms"``. Results then depend on
+                the speed of the machine.
             seed: Same seed, same motions.
             progress: Called as ``progress(phase, done, total)`` during long loops.
 
@@ -122,7 +130,7 @@ class MotionPipeline(ABC, Generic[_Plan]):
         """
         started = time.perf_counter()
         check_sampling(samples=samples, seed=seed)
-        plan = self.resolve_preset(preset, guidance_scale)
+        plan = self.limited(self.resolve_preset(preset, guidance_scale), tolerance, time_budget)
         arrange = partial(
             Scene.of_call,
             prompt,
@@ -136,6 +144,8 @@ class MotionPipeline(ABC, Generic[_Plan]):
             arrange(seconds=None, frames=MAX_FRAMES)  # an unusable call is refused before any network runs
             frames = self._drawn_frames(self.length, prompt, controls, seed)
         scene = arrange(seconds=seconds, frames=frames)
+        is_exact = self.wants_exact(plan)
+        check_reach(scene.controls, self.skeleton, is_strict=is_exact)
         canonical = scene.canonical
         latents = self.generate_latents(
             self.text_encoder.encode([scene.prompt]).pooled.expand(samples, -1),
@@ -148,7 +158,31 @@ class MotionPipeline(ABC, Generic[_Plan]):
             progress=progress,
         )
         features = self.decoder.features(latents)[:, : scene.frames]
-        return scene.result(features, latents, seconds_taken=time.perf_counter() - started)
+        reports: list[ExactReport] = []
+        if is_exact:
+            for clip, edited in enumerate(features):
+                features[clip], report = meet_exactly(
+                    edited, canonical.targets, canonical.mask, self.skeleton
+                )
+                reports.append(report)
+        seconds_taken = time.perf_counter() - started
+        return scene.result(features, latents, seconds_taken=seconds_taken, exact=tuple(reports))
+
+    def wants_exact(self, plan: _Plan) -> bool:  # noqa: ARG002 (for subclasses)
+        """Whether joints are moved onto their targets after editing."""
+        return False
+
+    def limited(self, plan: _Plan, tolerance: str | float | None, time_budget: str | float | None) -> _Plan:
+        """``plan`` with other limits of editing.
+
+        Raises:
+            ValueError: If a limit is unusable, or this pipeline knows none.
+        """
+        if tolerance is not None or time_budget is not None:
+            raise ValueError(
+                f"{type(self).__name__} knows no `tolerance` and no `time_budget`. Choose a preset instead."
+            )
+        return plan
 
     def padded_frames(self, frames: int) -> int:
         """Frames that the networks work on for a motion of ``frames``: whole tokens."""

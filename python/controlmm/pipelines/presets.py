@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from controlmm.generation.decoding_rules import DecodingRules
 from controlmm.generation.editing import EditingBudget
 from controlmm.ops.consistency import NORM_CODES, Norm
+
+_LENGTHS = {"m": 1.0, "mm": 0.001, "cm": 0.01}
+_TIMES = {"s": 1.0, "ms": 0.001}
 
 
 @dataclass(frozen=True)
@@ -20,6 +25,9 @@ class Preset:
     residual_guidance_scale: float = 5.0
     control_norm: Norm = "mse"  # of the distance that editing minimises: published code; the paper: "l2"
     rules: DecodingRules = field(default_factory=DecodingRules)
+    is_exact: bool = (
+        False  # after editing, move the joints onto their targets; see controlmm.generation.exact
+    )
 
     def __post_init__(self) -> None:
         if isinstance(self.steps, bool) or not isinstance(self.steps, int) or self.steps < 1:
@@ -37,6 +45,7 @@ PRESETS = {
     "fast": Preset(EditingBudget(solver="auto", latent_iterations=10, tolerance=0.01)),
     "balanced": Preset(EditingBudget(solver="auto", latent_iterations=25, tolerance=0.003)),
     "accurate": Preset(EditingBudget(solver="auto", latent_iterations=60, tolerance=0.001)),
+    "exact": Preset(EditingBudget(solver="auto", latent_iterations=60, tolerance=0.001), is_exact=True),
     "paper-fast": Preset(EditingBudget(latent_iterations=100)),
     "paper-medium": Preset(EditingBudget(latent_iterations=600)),
     "paper-accurate": Preset(EditingBudget(logits_iterations=100, latent_iterations=600)),
@@ -71,3 +80,46 @@ def preset_named(name: str) -> Preset:
     if name not in PRESETS:
         raise ValueError(f"Unknown `preset` {name!r}. Use one of: {', '.join(PRESETS)}.")
     return PRESETS[name]
+
+
+def with_limits(
+    plan: Preset, *, tolerance: str | float | None = None, time_budget: str | float | None = None
+) -> Preset:
+    """``plan`` with other limits of latent editing; ``None`` leaves one as it is.
+
+    Args:
+        plan: A preset.
+        tolerance: Control error at which a clip is done, in metres or with a unit: ``"1mm"``, ``"2 cm"``.
+        time_budget: Time for the editing of latents, in seconds or with a unit: ``"200ms"``.
+
+    Raises:
+        ValueError: If a quantity is unusable.
+    """
+    budget = plan.budget
+    if tolerance is not None:
+        budget = replace(budget, tolerance=quantity("tolerance", tolerance, _LENGTHS))
+    if time_budget is not None:
+        budget = replace(budget, time_budget=quantity("time_budget", time_budget, _TIMES))
+    return replace(plan, budget=budget)
+
+
+def quantity(name: str, value: str | float, units: Mapping[str, float]) -> float:
+    """A positive number, given plain or as text with one of the units.
+
+    Raises:
+        ValueError: If it is none; the message shows the units.
+    """
+    number: float | None = None
+    if isinstance(value, str):
+        match = re.fullmatch(r"\s*([0-9.]+(?:e-?[0-9]+)?)\s*([a-z]+)\s*", value)
+        if match is not None and match[2] in units and match[1].count(".") <= 1 and match[1] != ".":
+            number = float(match[1]) * units[match[2]]
+    elif not isinstance(value, bool) and isinstance(value, int | float):
+        number = float(value)
+    if number is None or not (math.isfinite(number) and number > 0):
+        first, *rest = units
+        raise ValueError(
+            f"`{name}` must be a positive number of {first} or text such as "
+            f"{' or '.join(repr(f'5{unit}') for unit in rest)}, got {value!r}."
+        )
+    return number

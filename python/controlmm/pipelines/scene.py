@@ -22,6 +22,7 @@ from controlmm.controls import (
     densify,
     penetration,
 )
+from controlmm.generation.exact import ExactReport
 from controlmm.generation.objective import control_error
 from controlmm.generation.terms import JointTerm, ObjectiveTerm, OnFloor, obstacle_terms
 from controlmm.motion.ground import grounded
@@ -135,6 +136,7 @@ class Scene:
         *,
         seconds_taken: float,
         on_floor: bool | None = None,
+        exact: tuple[ExactReport, ...] = (),
     ) -> GenerationResult:
         """Decoded features (de-normalised, networks' frame) as motions in the user's world.
 
@@ -148,7 +150,7 @@ class Scene:
             joints, self.controls.targets.expand_as(joints), self.controls.mask.expand_as(joints)
         )
         depth = penetration(joints, self.obstacles, motions[0].skeleton)
-        return GenerationResult(motions, error, depth, latents, seconds_taken)
+        return GenerationResult(motions, error, depth, latents, seconds_taken, exact)
 
     def _motion(self, features: Float[Tensor, "T D"]) -> Motion:
         motion = Motion.from_features(features.contiguous(), text=self.prompt)

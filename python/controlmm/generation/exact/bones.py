@@ -1,0 +1,86 @@
+"""Bones of the right length again, targets kept: inverse kinematics frame by frame."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from controlmm.generation.exact.projection import STIFFNESS, graph_laplacian
+from controlmm.motion.skeleton import Skeleton
+
+_ITERATIONS = 20
+_ENOUGH = 1e-5  # metres of the worst bone
+_HELD, _PLANTED = 1e9, 1e4  # resistance of a coordinate against change, free ones have about 1
+_WIDTH = 2.0  # frames: standard deviation of what smooths corrections in time
+_SLACK = 1e-9  # so that a chain that cannot reach gives the nearest pose instead of none
+
+
+def restore_bones(
+    joints: Float[Tensor, "T J 3"],
+    lengths: Float[Tensor, "J"],
+    held: Bool[Tensor, "T J 3"],
+    planted: Bool[Tensor, "T J"],
+    skeleton: Skeleton,
+) -> Float[Tensor, "T J 3"]:
+    """The joints moved little and smoothly so that every bone has its length; float64.
+
+    What each frame by itself would change is smoothed in time, and then each frame finds the nearest pose.
+    Held coordinates do not move, planted joints hardly; where bones cannot span what is held, lengths stay
+    wrong.
+
+    Args:
+        joints: Positions.
+        lengths: Of the bone from every joint to its parent; that of the root is not used.
+        held: Coordinates that stay.
+        planted: Joints that should stay.
+        skeleton: The hierarchy.
+    """
+    joints = joints.double()
+    first = _restored(joints, lengths, held, planted, skeleton)
+    smoothed = torch.where(held, joints, joints + _smooth(first - joints))
+    return _restored(smoothed, lengths, held, planted, skeleton)
+
+
+def _smooth(change: Float[Tensor, "T J 3"]) -> Float[Tensor, "T J 3"]:
+    """A Gaussian average over time; the ends are continued."""
+    reach = int(4 * _WIDTH)
+    kernel = torch.exp(-0.5 * (torch.arange(-reach, reach + 1).double() / _WIDTH) ** 2)
+    rows = change.flatten(1).T[:, None]  # (3J, 1, T)
+    padded = torch.nn.functional.pad(rows, (reach, reach), mode="replicate")
+    smoothed = torch.nn.functional.conv1d(padded, (kernel / kernel.sum())[None, None])
+    result: Tensor = smoothed[:, 0].T.unflatten(1, change.shape[1:])
+    return result
+
+
+def _restored(
+    joints: Float[Tensor, "T J 3"],
+    lengths: Float[Tensor, "J"],
+    held: Bool[Tensor, "T J 3"],
+    planted: Bool[Tensor, "T J"],
+    skeleton: Skeleton,
+) -> Float[Tensor, "T J 3"]:
+    """Newton's method on the constraints, each frame by itself."""
+    frames, count = joints.shape[:2]
+    start = moved = joints.double()
+    resistance = torch.kron(STIFFNESS * graph_laplacian(skeleton) + torch.eye(count), torch.eye(3))
+    extra = _PLANTED * planted[..., None].expand(-1, -1, 3) + _HELD * held
+    yielding = torch.linalg.inv(resistance + torch.diag_embed(extra.double().flatten(1)))  # (T, 3J, 3J)
+    children = torch.arange(1, count)
+    parents = torch.tensor(skeleton.parents[1:])
+    wanted = lengths.double()[1:]
+    for _ in range(_ITERATIONS):
+        bones = moved[:, children] - moved[:, parents]
+        length = bones.norm(dim=-1)
+        if (length - wanted).abs().max() < _ENOUGH:
+            break
+        direction = bones / length.clamp(min=1e-9)[..., None]
+        slopes = torch.zeros(frames, count - 1, count, 3, dtype=torch.float64)
+        slopes[:, children - 1, children] = direction
+        slopes[:, children - 1, parents] = -direction
+        slopes = slopes.flatten(2)
+        answers = yielding @ slopes.mT  # (T, 3J, J - 1)
+        matrix = slopes @ answers + _SLACK * torch.eye(count - 1)
+        forces = torch.linalg.solve(matrix, (wanted - length)[..., None])
+        moved = moved + (answers @ forces).unflatten(1, (count, 3))[..., 0]
+    return torch.where(held, start, moved)

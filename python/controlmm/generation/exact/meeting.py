@@ -1,0 +1,116 @@
+"""The exact mode as a whole: project, restore the bones, refit the features, say what it cost."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from controlmm.generation.exact.bones import restore_bones
+from controlmm.generation.exact.projection import project_on_targets
+from controlmm.generation.exact.refit import refit_features
+from controlmm.motion.features import bone_lengths
+from controlmm.motion.layout import feature_layout
+from controlmm.motion.skeleton import Skeleton
+from controlmm.ops import recover_joints
+
+_PLANTED_SPEED = 0.5  # metres a second; a foot in contact that is faster slides already
+_CONTACT = 0.5  # of the contact channels
+_PER_METRE = {"m": 1.0, "mm": 1000.0}
+
+
+@dataclass(frozen=True)
+class ExactReport:
+    """What the exact mode did to one clip. Pairs are before and after.
+
+    Attributes:
+        residual: Largest distance of a controlled coordinate to its target, metres.
+        bone_error: Largest difference of a bone from the skeleton's length, metres.
+        jerk: Mean size of the third derivative of all joints, m/s^3.
+        slide: Mean horizontal speed of planted feet, m/s.
+    """
+
+    residual: tuple[float, float]
+    bone_error: tuple[float, float]
+    jerk: tuple[float, float]
+    slide: tuple[float, float]
+
+
+def meet_exactly(
+    features: Float[Tensor, "T D"],
+    targets: Float[Tensor, "T J 3"],
+    mask: Bool[Tensor, "T J 3"],
+    skeleton: Skeleton,
+) -> tuple[Float[Tensor, "T D"], ExactReport]:
+    """Features whose joints lie on the targets, changed least.
+
+    Args:
+        features: De-normalised, of an edited motion that is near its targets.
+        targets: In the networks' frame, the skeleton's unit.
+        mask: The controlled coordinates.
+        skeleton: Its bone lengths are kept, where they are published; else those that the clip has on
+            average.
+    """
+    joints = recover_joints(features[None].double(), joints=skeleton.num_joints)[0]
+    targets = targets.double()
+    held = mask.clone()
+    held[0, 0, [0, 2]] = True  # features begin with the root at x = z = 0
+    wanted = torch.where(mask, targets, joints)
+    lengths = _lengths(joints, skeleton)
+    planted = planted_feet(features, joints, skeleton)
+    moved = project_on_targets(joints, wanted, held, planted, skeleton)
+    moved = restore_bones(moved, lengths, held, planted, skeleton)
+    fitted = refit_features(features, moved, skeleton)
+    after = recover_joints(fitted[None], joints=skeleton.num_joints)[0].double()
+    unit = _PER_METRE[skeleton.unit]
+
+    def both(measure: float, again: float) -> tuple[float, float]:
+        return measure / unit, again / unit
+
+    report = ExactReport(
+        residual=both(_residual(joints, targets, mask), _residual(after, targets, mask)),
+        bone_error=both(*(_bone_error(clip, lengths, skeleton) for clip in (joints, after))),
+        jerk=both(*(_jerk(clip, skeleton) for clip in (joints, after))),
+        slide=both(*(_slide(clip, planted, skeleton) for clip in (joints, after))),
+    )
+    return fitted, report
+
+
+def planted_feet(
+    features: Float[Tensor, "T D"], joints: Float[Tensor, "T J 3"], skeleton: Skeleton
+) -> Bool[Tensor, "T J"]:
+    """Joints of the feet that stand in a frame and the next: in contact, and slower than 0.5 m/s."""
+    feet = skeleton.foot_joints
+    in_contact = features[:, feature_layout(skeleton).foot_contacts] > _CONTACT
+    speed = joints[:, feet][..., [0, 2]].diff(dim=0).norm(dim=-1) * skeleton.fps / _PER_METRE[skeleton.unit]
+    stands = in_contact[:-1] & in_contact[1:] & (speed < _PLANTED_SPEED)
+    planted = torch.zeros(joints.shape[:2], dtype=torch.bool)
+    planted[:-1, list(feet)] = stands
+    return planted
+
+
+def _lengths(joints: Float[Tensor, "T J 3"], skeleton: Skeleton) -> Float[Tensor, "J"]:
+    if skeleton.bone_lengths is None:
+        return bone_lengths(joints, skeleton).mean(0)
+    lengths: Tensor = skeleton.rest_offsets().norm(dim=-1)
+    return lengths
+
+
+def _residual(joints: Tensor, targets: Tensor, mask: Tensor) -> float:
+    return (joints - targets)[mask].abs().max().item() if mask.any() else 0.0
+
+
+def _bone_error(joints: Tensor, lengths: Tensor, skeleton: Skeleton) -> float:
+    error = (bone_lengths(joints, skeleton) - lengths)[:, 1:].abs().max()
+    return float(error)
+
+
+def _jerk(joints: Tensor, skeleton: Skeleton) -> float:
+    return float((joints.diff(n=3, dim=0) * skeleton.fps**3).norm(dim=-1).mean())
+
+
+def _slide(joints: Tensor, planted: Tensor, skeleton: Skeleton) -> float:
+    step = joints[..., [0, 2]].diff(dim=0).norm(dim=-1)[planted[:-1]] * skeleton.fps
+    return step.mean().item() if len(step) else 0.0

@@ -1,0 +1,190 @@
+"""The exact mode: against a dense KKT solve, bone lengths, planted feet, features; targets out of reach."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import pytest
+import torch
+
+from controlmm.controls import JointControl, densify
+from controlmm.generation.exact import meet_exactly
+from controlmm.generation.exact.bones import restore_bones
+from controlmm.generation.exact.projection import (
+    SMOOTHNESS,
+    STIFFNESS,
+    Constraints,
+    SmoothMetric,
+    graph_laplacian,
+    project_on_targets,
+)
+from controlmm.generation.exact.refit import refit_features
+from controlmm.motion.features import bone_lengths, canonicalize, joints_to_features
+from controlmm.motion.skeleton import HUMANML3D
+from controlmm.ops import recover_joints
+from controlmm.pipelines import PRESETS
+from controlmm.pipelines.reach import chain_lengths, check_reach
+
+TENTH_OF_A_MILLIMETRE = 1e-4
+LENGTHS = HUMANML3D.rest_offsets().norm(dim=-1)
+
+
+def random(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+@pytest.fixture
+def features(walk) -> torch.Tensor:
+    return joints_to_features(canonicalize(walk(41)))
+
+
+def joints_of(features: torch.Tensor) -> torch.Tensor:
+    return recover_joints(features[None].double(), joints=22)[0]
+
+
+def test_the_projection_is_the_solution_of_the_dense_system():
+    """min x^T R x subject to A x = r, by its Karush-Kuhn-Tucker matrix."""
+    frames, count = 6, 22
+    second = torch.eye(frames).double().diff(n=2, dim=0)
+    size = torch.kron(torch.eye(frames), STIFFNESS * graph_laplacian(HUMANML3D) + torch.eye(count))
+    size = size + SMOOTHNESS * torch.kron(second.T @ second, torch.eye(count))
+    where, bones, values = torch.tensor([1, 4, 4]), torch.tensor([0, 20, 3]), random(3, 2)
+    rows = torch.zeros(3, frames * count).double()
+    rows[torch.arange(3), where * count + bones] = 1
+    kkt = torch.cat([torch.cat([size, rows.T], 1), torch.cat([rows, torch.zeros(3, 3)], 1)])
+    right = torch.cat([torch.zeros(frames * count, 2), values])
+    expected = torch.linalg.solve(kkt, right)[: frames * count].reshape(frames, count, 2)
+    no_steps = torch.zeros(0, 2, dtype=torch.long)
+    change = SmoothMetric(HUMANML3D, frames).project(Constraints(where, bones, values, no_steps))
+    torch.testing.assert_close(change, expected, rtol=1e-8, atol=1e-8)
+
+
+def test_targets_are_met_and_nothing_moves_without_any():
+    joints, mask = random(12, 22, 3), torch.zeros(12, 22, 3, dtype=torch.bool)
+    nowhere = torch.zeros(12, 22, dtype=torch.bool)
+    same = project_on_targets(joints, joints, mask, nowhere, HUMANML3D)
+    assert torch.equal(same, joints)
+    mask[3, 20], mask[9, 0, [0, 2]] = True, True
+    targets = joints + 0.2
+    moved = project_on_targets(joints, targets, mask, nowhere, HUMANML3D)
+    assert torch.equal(moved[mask], targets[mask])
+    assert torch.equal(moved[..., 1][:3], moved[..., 1][:3])
+
+
+def test_planted_feet_move_alike():
+    joints, mask = random(12, 22, 3), torch.zeros(12, 22, 3, dtype=torch.bool)
+    mask[5, 0], planted = True, torch.zeros(12, 22, dtype=torch.bool)
+    planted[3:8, 10] = True
+    change = project_on_targets(joints, joints + 0.3, mask, planted, HUMANML3D) - joints
+    free = project_on_targets(joints, joints + 0.3, mask, planted & False, HUMANML3D) - joints
+    steps = [x[3:9, 10].diff(dim=0).norm(dim=-1).max() for x in (change, free)]
+    assert steps[0] < 0.05 * steps[1]
+
+
+def test_bones_get_their_lengths_and_held_coordinates_stay(walk):
+    joints = walk(20).double()
+    bent = joints + 0.02 * random(20, 22, 3, seed=1)
+    held = torch.zeros(20, 22, 3, dtype=torch.bool)
+    held[7, 20], held[:, 0, 1] = True, True
+    moved = restore_bones(bent, LENGTHS, held, torch.zeros(20, 22, dtype=torch.bool), HUMANML3D)
+    assert (bone_lengths(moved, HUMANML3D) - LENGTHS)[:, 1:].abs().max() < TENTH_OF_A_MILLIMETRE
+    assert torch.equal(moved[held], bent[held])
+    assert (moved - bent).abs().max() < 0.2
+
+
+def test_features_are_fitted_to_moved_joints(features):
+    moved = joints_of(features) + 0.05 * random(40, 22, 3, seed=2)
+    moved[0, 0, [0, 2]] = 0
+    fitted = refit_features(features, moved, HUMANML3D)
+    torch.testing.assert_close(joints_of(fitted), moved, rtol=0, atol=1e-5)
+
+
+def test_features_of_joints_that_did_not_move_stay(features):
+    """Rotations and velocities are those that the feature code computes, heading and contacts untouched."""
+    fitted = refit_features(features, joints_of(features), HUMANML3D)
+    torch.testing.assert_close(fitted, features, rtol=0, atol=2e-4)  # rotations: float32 quaternions
+
+
+@pytest.fixture
+def reach(features):
+    """A wrist and the pelvis to be 10 to 20 cm elsewhere."""
+    targets, mask = joints_of(features), torch.zeros(40, 22, 3, dtype=torch.bool)
+    targets[30, 20] += torch.tensor([0.1, 0.15, 0.1])
+    targets[15, 0] += torch.tensor([0.1, -0.05, 0.1])
+    mask[30, 20] = mask[15, 0] = True
+    return targets, mask
+
+
+def test_the_exact_mode_meets_targets_with_whole_bones(features, reach):
+    targets, mask = reach
+    fitted, report = meet_exactly(features, targets, mask, HUMANML3D)
+    joints = joints_of(fitted)
+    assert (joints - targets)[mask].abs().max() < TENTH_OF_A_MILLIMETRE
+    assert (bone_lengths(joints, HUMANML3D) - LENGTHS)[:, 1:].abs().max() < 1e-3
+    assert report.residual[0] > 0.1 > TENTH_OF_A_MILLIMETRE > report.residual[1]
+    assert report.bone_error[1] < 1e-3
+    assert report.slide[1] <= 1.05 * report.slide[0] + 0.01
+
+
+def test_the_exact_mode_leaves_a_motion_that_is_there_alone(features):
+    fitted, _ = meet_exactly(
+        features, joints_of(features), torch.zeros(40, 22, 3, dtype=torch.bool), HUMANML3D
+    )
+    torch.testing.assert_close(joints_of(fitted), joints_of(features), rtol=0, atol=2e-4)
+
+
+def test_chains_add_their_bones():
+    lengths = chain_lengths(HUMANML3D)
+    arm = LENGTHS[[3, 6, 9, 13, 16, 18, 20]].sum()
+    torch.testing.assert_close(lengths[0, 20], arm)
+    torch.testing.assert_close(lengths[10, 11], LENGTHS[[1, 4, 7, 10, 2, 5, 8, 11]].sum())
+    assert torch.equal(lengths, lengths.T)
+
+
+@pytest.fixture
+def impossible():
+    return [
+        JointControl("pelvis", frames=[8], positions=[[0.0, 0.9, 0.0]]),
+        JointControl("left_wrist", frames=[8], positions=[[3.0, 0.9, 0.0]]),
+    ]
+
+
+MESSAGE = (
+    r"`controls` ask for the impossible: in frame 8, left_wrist is to be 3\.00 m away from pelvis, but the "
+    r"bones between them reach 1\.12 m\. Move one of them, or leave one free\."
+)
+
+
+def test_targets_out_of_reach_are_reported_with_the_distance(impossible):
+    dense = densify(impossible, 16, HUMANML3D)
+    with pytest.raises(ValueError, match=MESSAGE):
+        check_reach(dense, HUMANML3D, is_strict=True)
+    with pytest.warns(UserWarning, match=MESSAGE):
+        check_reach(dense, HUMANML3D, is_strict=False)
+
+
+def test_targets_within_reach_are_not_complained_about(impossible):
+    near = JointControl("left_wrist", frames=[8], positions=[[1.0, 0.9, 0.0]])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_reach(densify([impossible[0], near], 16, HUMANML3D), HUMANML3D, is_strict=True)
+        check_reach(densify(impossible[1:], 16, HUMANML3D), HUMANML3D, is_strict=True)
+
+
+def test_the_exact_preset_refuses_the_impossible_before_any_network_runs(tiny_pipeline, impossible):
+    tiny_pipeline.transformer = None
+    with pytest.raises(ValueError, match="`controls` ask for the impossible"):
+        tiny_pipeline("a person reaches", frames=16, controls=impossible, preset="exact")
+
+
+def test_the_exact_preset_meets_targets_to_a_tenth_of_a_millimetre(tiny_pipeline):
+    budget = replace(PRESETS["exact"].budget, latent_iterations=5)
+    plan = replace(PRESETS["exact"], budget=budget, steps=2)
+    control = JointControl("right_wrist", frames=[9], positions=[[0.3, 1.2, 0.2]])
+    result = tiny_pipeline("a person reaches", frames=16, controls=[control], preset=plan, samples=2)
+    assert result.control_error.max() < TENTH_OF_A_MILLIMETRE
+    assert len(result.exact) == 2
+    for motion, report in zip(result, result.exact, strict=True):
+        assert (motion.joints[9, 21] - torch.tensor([0.3, 1.2, 0.2])).abs().max() < TENTH_OF_A_MILLIMETRE
+        assert report.residual[1] < TENTH_OF_A_MILLIMETRE
