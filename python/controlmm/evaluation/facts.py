@@ -112,7 +112,7 @@ def _trunk_and_feet(joints: Float[Tensor, "T J 3"]) -> dict[str, float]:
     trunk = joints[:, _NECK] - joints[:, 0]
     forward = _forward(joints)
     lean = torch.atan2((trunk[:, [0, 2]] * forward).sum(1), trunk[:, 1])
-    stands = pelvis > _UPRIGHT * pelvis.max()
+    stands = pelvis >= _UPRIGHT * pelvis.max()
     height = {side: joints[:, list(_SIDES[side][3:]), 1] for side in _SIDES}
     lifted = {side: (h - h.amin(0)).amin(1) for side, h in height.items()}
     ball = {side: joints[:, _SIDES[side][4], 1] for side in _SIDES}
@@ -150,9 +150,11 @@ def _forward(joints: Float[Tensor, "T J 3"]) -> Float[Tensor, "T 2"]:
 
 
 def _smoothed(values: Float[Tensor, "T N"]) -> Float[Tensor, "T N"]:
-    """Moving average, ends repeated."""
+    """Moving average; beyond the ends values go on as they came, so that even ways stay as they are."""
     half = _SMOOTHING // 2
-    padded = torch.cat([values[:1].expand(half, -1), values, values[-1:].expand(half, -1)])
+    before = 2 * values[:1] - values[1 : half + 1].flip(0)
+    after = 2 * values[-1:] - values[-half - 1 : -1].flip(0)
+    padded = torch.cat([before, values, after])
     return padded.unfold(0, _SMOOTHING, 1).mean(-1)
 
 
