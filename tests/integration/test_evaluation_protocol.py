@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,6 +24,7 @@ from controlmm.pipelines import ControlMM, Preset
 from controlmm.text.hashing import HashingTextEncoder
 
 QUICK = Preset(EditingBudget(latent_iterations=2), steps=2)
+EXACT = 1e-4  # metres; float32 features of joints that lie on their targets
 ROUNDING = 1e-4  # of embeddings and errors when the batch around a clip changes
 
 
@@ -88,6 +90,18 @@ def test_a_stopped_run_goes_on_and_gives_the_same_numbers(
     files[0].write_bytes(files[0].read_bytes()[:100])  # even cut short by the kill
     resumed, unbroken = (run(tmp_path / name, Generated(tiny_pipeline, QUICK)) for name in ("stopped", "new"))
     assert json.dumps(resumed) == json.dumps(unbroken)
+
+
+def test_the_exact_preset_meets_targets_here_too(
+    tiny_pipeline: ControlMM, test_set: TestSet, evaluator: Evaluator, tmp_path: Path
+) -> None:
+    exact = dataclasses.replace(QUICK, is_exact=True)
+    rows = [
+        Row(name, Generated(tiny_pipeline, preset), ControlSetting("random", 5))
+        for name, preset in (("quick", QUICK), ("exact", exact))
+    ]
+    quick, met = evaluate_rows(rows, test_set, evaluator, Protocol(), tmp_path, progress=False)
+    assert met["average_joint"].mean < EXACT < quick["average_joint"].mean
 
 
 def test_more_repeats_go_on_where_fewer_ended(

@@ -52,6 +52,7 @@ def reproduce(
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
 ) -> None:
     """Print a table of the paper with our rows beneath; write it, JSON and pictures to a folder."""
+    from controlmm.cli.result_pictures import save_pictures
     from controlmm.evaluation.evaluators import load_evaluator
     from controlmm.evaluation.protocol import Protocol, evaluate_rows
     from controlmm.evaluation.test_set import read_test_set
@@ -69,6 +70,8 @@ def reproduce(
     facts = facts_of(test_set, protocol, seconds=time.perf_counter() - started)
     facts["editing iterations"] = "the paper's" if effort == 1 else f"{effort:g} of the paper's"
     _write(plan, scores, facts, judge.caution, out / table)
+    for picture in save_pictures(plan, scores, out / table, effort=effort):
+        typer.echo(str(picture))
 
 
 def _plan(
@@ -94,8 +97,7 @@ def _plan(
 def _write(
     plan: Reproduction, scores: list[RowScores], facts: dict[str, Any], caution: str, out: Path
 ) -> None:
-    """Print the table; write it as Markdown and JSON, and the pictures that go with it."""
-    from controlmm.cli.result_pictures import save_pictures
+    """Print the table; write it as Markdown and JSON."""
     from controlmm.evaluation.report import write_json
 
     text = _page(f"{plan.name}: {plan.published.title}", facts, plan.markdown(scores), [*plan.notes, caution])
@@ -103,8 +105,6 @@ def _write(
     rows = [score.as_json() for score in scores]
     write_json(out / f"{plan.name}.json", {"table": plan.name, **facts, "caution": caution, "rows": rows})
     typer.echo(text)
-    for picture in save_pictures(plan, scores, out):
-        typer.echo(str(picture))
 
 
 def _page(title: str, facts: dict[str, Any], table: str, notes: list[str]) -> str:

@@ -22,16 +22,22 @@ _PANELS = {  # metric: title and factor
 }
 
 
-def save_pictures(table: Reproduction, scores: Sequence[RowScores], out: Path) -> list[Path]:
-    """Figure 2 for table 5, curves for tables of one changing number; nothing for the others."""
+def save_pictures(
+    table: Reproduction, scores: Sequence[RowScores], out: Path, *, effort: float
+) -> list[Path]:
+    """Figure 2 for table 5, curves for tables of one changing number; nothing for the others.
+
+    ``effort``, the share of the papers' iterations, is said in the picture unless it is 1.
+    """
+    aside = "" if effort == 1 else f", {effort:g} of the iterations"
     if table.name == "table5":
-        return [_tradeoff(table, scores, out / "figure2.png")]
+        return [_tradeoff(table, scores, out / "figure2.png", aside)]
     if table.name in _CURVES:
-        return [_curves(table, scores, out / f"{table.name}.png")]
+        return [_curves(table, scores, out / f"{table.name}.png", aside)]
     return []
 
 
-def _tradeoff(table: Reproduction, scores: Sequence[RowScores], path: Path) -> Path:
+def _tradeoff(table: Reproduction, scores: Sequence[RowScores], path: Path, aside: str) -> Path:
     from controlmm.viewer.evaluation_charts import save_tradeoff
 
     published, columns = table.published, table.published.columns
@@ -41,17 +47,20 @@ def _tradeoff(table: Reproduction, scores: Sequence[RowScores], path: Path) -> P
         (line.keys[0], s["seconds"].mean, 100 * s["average_joint"].mean, s["fid"].mean)
         for line, s in zip(table.lines, scores, strict=True)
     ]
-    groups = {"published (A100, published evaluator)": theirs, "ours (this machine and evaluator)": ours}
+    groups = {
+        "published (A100, published evaluator)": theirs,
+        f"ours (this machine and evaluator{aside})": ours,
+    }
     return save_tradeoff(groups, path, title="Error, FID and time")
 
 
-def _curves(table: Reproduction, scores: Sequence[RowScores], path: Path) -> Path:
+def _curves(table: Reproduction, scores: Sequence[RowScores], path: Path, aside: str) -> Path:
     from controlmm.viewer.evaluation_charts import save_curves
 
     x = list(dict.fromkeys(line.keys[-1].split(",")[0] for line in table.lines))
     systems: dict[str, list[RowScores]] = {}
     for line, score in zip(table.lines, scores, strict=True):
-        systems.setdefault(_system_of(line.keys), []).append(score)
+        systems.setdefault(_system_of(line.keys) or f"paper's settings{aside}", []).append(score)
     panels: Mapping[str, dict[str, list[float]]] = {
         title: {name: [factor * s[metric].mean for s in found] for name, found in systems.items()}
         for metric, (title, factor) in _PANELS.items()
@@ -60,7 +69,5 @@ def _curves(table: Reproduction, scores: Sequence[RowScores], path: Path) -> Pat
 
 
 def _system_of(keys: Sequence[str]) -> str:
-    """The first cell of lines with two, what follows a comma in lines with one, else the paper's settings."""
-    if len(keys) > 1:
-        return keys[0]
-    return keys[0].partition(", ")[2] or "paper's settings"
+    """The first cell of lines with two, what follows a comma in lines with one: nothing for the paper's."""
+    return keys[0] if len(keys) > 1 else keys[0].partition(", ")[2]

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from controlmm.evaluation.random_streams import stream_seed
 from controlmm.evaluation.test_set import MAX_FRAMES, Sample
+from controlmm.generation.exact import meet_exactly
 from controlmm.models.rvq_vae import frame_mask
 from controlmm.ops import recover_joints
 from controlmm.pipelines.pipeline import MotionPipeline
@@ -143,7 +144,21 @@ class Generated:
         tokens = MAX_FRAMES // pipeline.decoder.downsample
         latents = torch.nn.functional.pad(latents, (0, 0, 0, tokens - latents.shape[1]))
         features = pipeline.decoder.features(latents, frames)
+        if pipeline.wants_exact(self.preset):
+            self._meet_targets(features, batch)
         seconds = time.perf_counter() - started
         # Beyond the clips: what the decoder makes of empty tokens, as in the published evaluation.
         padding = pipeline.decoder.features(latents)
         return Produced(features.where(frames[..., None], padding), seconds, has_padding=True)
+
+    def _meet_targets(self, features: Float[Tensor, "B T D"], batch: Batch) -> None:
+        """The pipeline's exact mode, clip by clip, in place."""
+        mask = batch.mask[..., None].expand_as(batch.joints)
+        for clip, length in enumerate(batch.lengths.tolist()):
+            if mask[clip].any():
+                features[clip, :length], _ = meet_exactly(
+                    features[clip, :length],
+                    batch.joints[clip, :length],
+                    mask[clip, :length],
+                    self.pipeline.skeleton,
+                )
