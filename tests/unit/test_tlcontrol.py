@@ -174,7 +174,7 @@ def test_tokens_of_a_part_share_their_noise_and_parts_do_not():
 def test_the_text_counts_more_with_a_larger_guidance_scale(tiny_tlcontrol):
     results = [
         joints(tiny_tlcontrol(PROMPT, frames=40, preset=QUICK, guidance_scale=scale))
-        for scale in (None, 1.0, 100.0)
+        for scale in (None, 2.5, 100.0)
     ]
     assert torch.equal(results[0], results[1])
     assert (results[0] - results[2]).abs().max() > 1e-3
@@ -305,4 +305,5 @@ def test_presets_have_the_tolerances_of_the_papers_table():
     tolerances = [TLCONTROL_PRESETS[name].tolerance for name in ("fast", "balanced", "accurate", "paper")]
     assert tolerances == [1e-5, 1e-6, 1e-8, 1e-6]
     paper = TLCONTROL_PRESETS["paper"]
-    assert (paper.rate, paper.history, paper.iterations, paper.temperature) == (0.1, 200, 1000, 0.0)
+    assert (paper.rate, paper.history, paper.iterations) == (0.1, 200, 1000)
+    assert (paper.temperature, paper.guidance_scale) == (0.0, 1.0)

@@ -19,8 +19,8 @@ class TLControlPreset(CodeOptimization):
         vary: Only this body part differs between samples; ``None``: all do.
     """
 
-    temperature: float = 1.0
-    guidance_scale: float = 1.0
+    temperature: float = 0.5
+    guidance_scale: float = 2.5
     vary: str | None = None
 
     def __post_init__(self) -> None:
@@ -37,7 +37,9 @@ TLCONTROL_PRESETS = {
     "fast": TLControlPreset(tolerance=1e-5),
     "balanced": TLControlPreset(),
     "accurate": TLControlPreset(tolerance=1e-8),
-    "paper": TLControlPreset(temperature=0.0, rate=0.1, loss="smooth_l1", foot="published"),
+    "paper": TLControlPreset(
+        temperature=0.0, guidance_scale=1.0, rate=0.1, loss="smooth_l1", foot="published"
+    ),
 }
 
 
