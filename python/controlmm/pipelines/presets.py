@@ -42,10 +42,10 @@ class Preset:
 
 # Measured by `python -m benchmarks.editing`. The papers' iteration counts are there to compare with.
 PRESETS = {
-    "fast": Preset(EditingBudget(solver="auto", latent_iterations=10, tolerance=0.01)),
-    "balanced": Preset(EditingBudget(solver="auto", latent_iterations=25, tolerance=0.003)),
-    "accurate": Preset(EditingBudget(solver="auto", latent_iterations=60, tolerance=0.001)),
-    "exact": Preset(EditingBudget(solver="auto", latent_iterations=60, tolerance=0.001), is_exact=True),
+    "fast": Preset(EditingBudget(solver="auto", latent_iterations=20, tolerance=0.01)),
+    "balanced": Preset(EditingBudget(solver="auto", latent_iterations=40, tolerance=0.003)),
+    "accurate": Preset(EditingBudget(solver="auto", latent_iterations=80, tolerance=0.001)),
+    "exact": Preset(EditingBudget(solver="auto", latent_iterations=80, tolerance=0.001), is_exact=True),
     "paper-fast": Preset(EditingBudget(latent_iterations=100)),
     "paper-medium": Preset(EditingBudget(latent_iterations=600)),
     "paper-accurate": Preset(EditingBudget(logits_iterations=100, latent_iterations=600)),

@@ -11,7 +11,7 @@ from controlmm.motion.skeleton import Skeleton
 
 _ITERATIONS = 20
 _ENOUGH = 1e-5  # metres of the worst bone
-_HELD, _PLANTED = 1e9, 1e4  # resistance of a coordinate against change, free ones have about 1
+_HELD, _PLANTED, _FEET = 1e9, 1e4, 1e3  # resistance of a coordinate against change, free ones have about 1
 _WIDTH = 2.0  # frames: standard deviation of what smooths corrections in time
 _SLACK = 1e-9  # so that a chain that cannot reach gives the nearest pose instead of none
 
@@ -64,7 +64,9 @@ def _restored(
     frames, count = joints.shape[:2]
     start = moved = joints.double()
     resistance = torch.kron(STIFFNESS * graph_laplacian(skeleton) + torch.eye(count), torch.eye(3))
-    extra = _PLANTED * planted[..., None].expand(-1, -1, 3) + _HELD * held
+    stays = _PLANTED * planted
+    stays[:, list(skeleton.foot_joints)] += _FEET  # else knees would keep their place and feet would slide
+    extra = stays[..., None] + _HELD * held
     yielding = torch.linalg.inv(resistance + torch.diag_embed(extra.double().flatten(1)))  # (T, 3J, 3J)
     children = torch.arange(1, count)
     parents = torch.tensor(skeleton.parents[1:])

@@ -21,7 +21,7 @@ from controlmm.generation.solvers.curvature import Curvature
 from controlmm.generation.solvers.metric import Metric
 from controlmm.generation.solvers.stopping import Reason, Solution, Stopping, Watch
 
-_STEPS_OF_A_METRIC = 10  # then the clip has moved so far that it is made anew
+_EARLY_RENEWALS, _STEPS_OF_A_METRIC = (2, 5), 10  # steps after which a metric is made anew
 _HISTORY = 20
 _SUFFICIENT_DECREASE = 1e-4
 _MOST_HALVINGS = 8
@@ -99,7 +99,7 @@ class _Descent:
             self._shorten(value)
             return None
         self._done += 1
-        if self._done and self._done % _STEPS_OF_A_METRIC == 0:
+        if self._done in _EARLY_RENEWALS or (self._done and self._done % _STEPS_OF_A_METRIC == 0):
             self._renew(probe)
             value, weights = self._metric.weigh(probe.residual)
         self._value = value
