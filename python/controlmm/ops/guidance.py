@@ -88,19 +88,36 @@ def guidance_value_and_grad(
             decoded, targets, full_mask, mean, std, norm, packed, clearance, is_mean, obstacle_weight
         )
         return loss, gradient if out is None else out.copy_(gradient)
-    obstacle_arguments = native_arguments(packed, clearance)
     scalars = (clearance.margin, is_mean, obstacle_weight)
     if torch.compiler.is_compiling():
         tensors = [tensor.detach() for tensor in (decoded, mean, std, targets)]
         loss, gradient = torch.ops.controlmm.guidance_value_and_grad(
-            *tensors, full_mask, norm, *obstacle_arguments, *scalars
+            *tensors, full_mask, norm, *native_arguments(packed, clearance), *scalars
         )
         return loss, gradient if out is None else out.copy_(gradient)
     gradient = torch.zeros_like(decoded, requires_grad=False) if out is None else out
-    loss = guidance_native(
-        decoded, mean, std, targets, full_mask, norm, obstacle_arguments, *scalars, gradient
-    )
+    if len(packed) == 0:
+        return _control_native(decoded, mean, std, targets, full_mask, norm, gradient), gradient
+    arguments = native_arguments(packed, clearance)
+    loss = guidance_native(decoded, mean, std, targets, full_mask, norm, arguments, *scalars, gradient)
     return loss, gradient
+
+
+def _control_native(
+    decoded: Tensor,
+    mean: Tensor,
+    std: Tensor,
+    targets: Tensor,
+    mask: Tensor,
+    norm: Norm,
+    gradient: Tensor,
+) -> Float[Tensor, "B"]:
+    """The kernel alone, without obstacles: about half of the tensors to hand over."""
+    loss = decoded.new_empty(decoded.shape[0])
+    core().control_value_and_grad(
+        decoded, mean, std, targets, mask, NORM_CODES[norm], loss, gradient, torch.get_num_threads()
+    )
+    return loss
 
 
 def guidance_native(
@@ -118,11 +135,6 @@ def guidance_native(
 ) -> Float[Tensor, "B"]:
     """The kernel alone: writes ``gradient`` and returns the loss."""
     loss = decoded.new_empty(decoded.shape[0])
-    if obstacle_arguments[0].shape[0] == 0:
-        core().control_value_and_grad(
-            decoded, mean, std, targets, mask, NORM_CODES[norm], loss, gradient, torch.get_num_threads()
-        )
-        return loss
     core().guidance_value_and_grad(
         decoded, mean, std, targets, mask, NORM_CODES[norm], *obstacle_arguments, margin, is_mean,
         obstacle_weight, loss, gradient, torch.get_num_threads(),
