@@ -15,13 +15,16 @@ CONTROLMM_INLINE Lanes<T> gumbel_of(const Lanes<std::uint32_t>& words) {
 template <class T, class F>
 CONTROLMM_INLINE void for_each_noise_block(const GumbelArgs<T>& args, std::int64_t row, F visit) {
   const std::int64_t clip = args.source.first_clip + row / args.tokens, token = row % args.tokens;
-  for (std::int64_t group = 0; group * 4 * kLanes < args.codes; ++group) {
-    const Words words = random_words(args.source.seed, group, token, clip);
+  const std::int64_t groups = (args.codes + 4 * kLanes - 1) / (4 * kLanes);
+  Words next = random_words(args.source.seed, 0, token, clip);
+  for (std::int64_t group = 0; group < groups; ++group) {
+    const Words words = next;
+    // Early, because its long chain of products can run beside the logarithms of this group.
+    if (group + 1 < groups) next = random_words(args.source.seed, group + 1, token, clip);
     for (int w = 0; w < 4; ++w) {
       const std::int64_t first = (4 * group + w) * kLanes;
       if (first >= args.codes) return;
-      const std::int64_t count = lanes_left(args.codes, first);
-      visit(first, count, gumbel_of<T>(words.w[w]));
+      visit(first, lanes_left(args.codes, first), gumbel_of<T>(words.w[w]));
     }
   }
 }

@@ -62,10 +62,10 @@ CONTROLMM_INLINE void philox(Words& counter, std::uint64_t key) {
 
 // The random words of sixty-four neighbouring codes of one token: word w belongs to codes 16 w .. 16 w + 15.
 CONTROLMM_INLINE Words random_words(std::uint64_t key, std::int64_t group, std::int64_t token, std::int64_t clip) {
-  std::uint32_t first[kLanes];
-  for (std::int64_t i = 0; i < kLanes; ++i) first[i] = static_cast<std::uint32_t>(group * kLanes + i);
-  Words words = {{load(first), broadcast(static_cast<std::uint32_t>(token)),
-                  broadcast(static_cast<std::uint32_t>(clip)), zeros<std::uint32_t>()}};
+  constexpr std::uint32_t kIndex[kLanes] = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
+  const Lanes<std::uint32_t> first = load(kIndex) + broadcast(static_cast<std::uint32_t>(group * kLanes));
+  Words words = {{first, broadcast(static_cast<std::uint32_t>(token)), broadcast(static_cast<std::uint32_t>(clip)),
+                  zeros<std::uint32_t>()}};
   philox(words, key);
   return words;
 }
