@@ -127,7 +127,8 @@ def test_code_runs(block: Block, folder_of: Callable[[Path], Path]) -> None:
 def test_control_files_are_readable(block: Block, tmp_path: Path) -> None:
     file = tmp_path / f"block.{block.language}"
     file.write_text(block.text)
-    assert load_controls(file).controls
+    document = load_controls(file)
+    assert document.controls or document.obstacles or document.timeline
 
 
 def test_every_document_and_language_is_covered() -> None:

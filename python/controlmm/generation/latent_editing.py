@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from jaxtyping import Float
 from torch import Tensor
 
@@ -17,6 +19,7 @@ from controlmm.generation.solvers import (
     lbfgs,
 )
 
+_LBFGS_STEPS = 4  # for each step of Gauss-Newton, which costs as much and looks further ahead
 _PER_METRE = {"m": 1.0, "mm": 1000.0}  # of a skeleton's unit
 
 
@@ -35,7 +38,7 @@ def edit_latents(
         latents: Where to start.
         keep: 1 where a token may change, 0 in padding and where it is held fixed.
         budget: Solver and limits. ``auto`` takes Gauss-Newton for squared distances to targets and L-BFGS for
-            everything else.
+            everything else, with four steps where Gauss-Newton would take one.
         progress: Called after every evaluation.
     """
     unit = _PER_METRE[objective.decoder.normalizer.skeleton.unit]
@@ -56,6 +59,8 @@ def edit_latents(
             "`solver` 'gauss-newton' needs squared distances to targets of a residual tokenizer. Use 'lbfgs' "
             "or 'auto'."
         )
+    if budget.solver == "auto" and residuals is None:
+        stopping = replace(stopping, iterations=_LBFGS_STEPS * budget.latent_iterations)
     if budget.solver == "lbfgs" or residuals is None:
         return lbfgs(objective, latents, keep, stopping, progress=progress)
     return gauss_newton(residuals, latents, keep, stopping, progress=progress)
