@@ -53,35 +53,25 @@ def run_edit(
     mask = kept[None, ..., None].expand(samples, -1, -1, 3)
     targets = source.joints.expand(samples, -1, -1, -1) * mask
     text = pipeline.text_encoder.encode([prompt]).pooled.expand(samples, -1)
+    seeds = clip_seeds(seed, samples)
     if keep_parts:
         latents = pipeline.generate_latents(
             text,
             lengths=[frames] * samples,
             targets=targets,
             mask=mask,
-            seeds=clip_seeds(seed, samples),
+            seeds=seeds,
             preset=preset,
             progress=progress,
         )
     else:
-        step = pipeline.decoder.downsample
-        padded = -(-frames // step) * step
         whole = kept_frames(frames, keep, skeleton.fps)
-        is_kept = nn.functional.pad(whole, (0, padded - frames), value=True).unflatten(0, (-1, step)).all(1)
-        request = DecodingRequest(
-            text,
-            torch.ones(samples, padded // step, dtype=torch.bool),
-            ClipNoise(clip_seeds(seed, samples)),
-            steps=preset.steps,
-            guidance_scale=preset.guidance_scale,
-            rules=preset.rules,
-            progress=progress,
-        )
-        latents = _redrawn(pipeline, source, request, is_kept)
+        request = _request(pipeline, text, frames, seeds, preset, progress)
+        latents = _redrawn(pipeline, source, request, whole)
         if exact and keep:
-            pinning = _pinning(pipeline, targets, mask, padded)
-            keep_all = torch.ones(*request.valid.shape, 1)
-            latents = edit_latents(pinning, latents, keep_all, preset.budget, progress=progress).latents
+            pinning = _pinning(pipeline, targets, mask)
+            all_tokens = torch.ones(*request.valid.shape, 1)
+            latents = edit_latents(pinning, latents, all_tokens, preset.budget, progress=progress).latents
     features = pipeline.decoder.features(latents)[:, :frames]
     joints = recover_joints(features, joints=skeleton.num_joints)
     error = control_error(joints, targets, mask)
@@ -96,13 +86,34 @@ def run_edit(
     return GenerationResult(motions, error, torch.zeros_like(error), latents, time.perf_counter() - started)
 
 
+def _request(
+    pipeline: ControlMM,
+    text: Float[Tensor, "B E"],
+    frames: int,
+    seeds: Sequence[int],
+    preset: Preset,
+    progress: Progress | None,
+) -> DecodingRequest:
+    tokens = pipeline.padded_frames(frames) // pipeline.decoder.downsample
+    return DecodingRequest(
+        text,
+        torch.ones(len(text), tokens, dtype=torch.bool),
+        ClipNoise(seeds),
+        steps=preset.steps,
+        guidance_scale=preset.guidance_scale,
+        rules=preset.rules,
+        progress=progress,
+    )
+
+
 def _redrawn(
-    pipeline: ControlMM, source: SourceMotion, request: DecodingRequest, is_kept: Bool[Tensor, "L"]
+    pipeline: ControlMM, source: SourceMotion, request: DecodingRequest, kept: Bool[Tensor, "T"]
 ) -> Float[Tensor, "B L C"]:
-    """Latents whose kept tokens are the source's, in all layers, and whose others follow the text."""
-    tokenizer = pipeline.decoder.tokenizer
-    ids = _tokens(pipeline, source, len(is_kept) * pipeline.decoder.downsample)
-    ids = ids.expand(len(request.text), -1, -1)
+    """Latents with the source's tokens where all their frames are kept; the others follow the text."""
+    tokenizer, step = pipeline.decoder.tokenizer, pipeline.decoder.downsample
+    padded = request.valid.shape[1] * step
+    is_kept = nn.functional.pad(kept, (0, padded - len(kept)), value=True).unflatten(0, (-1, step)).all(1)
+    ids = _tokens(pipeline, source, padded).expand(len(request.text), -1, -1)
     editable = ~is_kept.expand(len(ids), -1)
     if editable.all():
         base_ids = vary_tokens(pipeline.transformer, request, ids[..., 0])
@@ -120,7 +131,7 @@ def _tokens(pipeline: ControlMM, source: SourceMotion, padded: int) -> Int[Tenso
     return ids
 
 
-def _pinning(pipeline: ControlMM, targets: Tensor, mask: Tensor, padded: int) -> ControlObjective:
-    missing = padded - targets.shape[1]
+def _pinning(pipeline: ControlMM, targets: Tensor, mask: Tensor) -> ControlObjective:
+    missing = pipeline.padded_frames(targets.shape[1]) - targets.shape[1]
     targets, mask = (nn.functional.pad(dense, (0, 0, 0, 0, 0, missing)) for dense in (targets, mask))
     return ControlObjective(pipeline.decoder, targets, mask, torch.ones(mask.shape[:2], dtype=torch.bool))
