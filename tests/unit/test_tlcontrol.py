@@ -174,7 +174,7 @@ def test_tokens_of_a_part_share_their_noise_and_parts_do_not():
 def test_the_text_counts_more_with_a_larger_guidance_scale(tiny_tlcontrol):
     results = [
         joints(tiny_tlcontrol(PROMPT, frames=40, preset=QUICK, guidance_scale=scale))
-        for scale in (None, 2.5, 100.0)
+        for scale in (None, 1.0, 100.0)
     ]
     assert torch.equal(results[0], results[1])
     assert (results[0] - results[2]).abs().max() > 1e-3

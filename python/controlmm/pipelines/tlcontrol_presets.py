@@ -15,12 +15,13 @@ class TLControlPreset(CodeOptimization):
     Attributes:
         temperature: Of the codes; 0 takes the most likely ones, as the paper does, and then all samples are
             alike.
-        guidance_scale: How strongly the text counts; 1 is the paper's.
+        guidance_scale: How strongly the text counts; 1 is the paper's. Above it, predicted codes may not fit
+            unusual paths any more, and the optimisation starts too far away.
         vary: Only this body part differs between samples; ``None``: all do.
     """
 
     temperature: float = 0.5
-    guidance_scale: float = 2.5
+    guidance_scale: float = 1.0
     vary: str | None = None
 
     def __post_init__(self) -> None:
