@@ -40,7 +40,7 @@ class Preset:
                 raise ValueError(f"`{name}` must be a finite number, got {value!r}.")
 
 
-# Measured by `python -m benchmarks.editing`. The papers' iteration counts are there to compare with.
+# `python -m benchmarks.editing` measures them. The papers' iteration counts are there to compare with.
 PRESETS = {
     "fast": Preset(EditingBudget(solver="auto", latent_iterations=20, tolerance=0.01)),
     "balanced": Preset(EditingBudget(solver="auto", latent_iterations=40, tolerance=0.003)),
