@@ -16,6 +16,7 @@ from controlmm.cli.generate import slug
 from controlmm.controls import (
     Avoid,
     ControlFile,
+    HalfSpace,
     PathControl,
     Sphere,
     TimelineEntry,
@@ -69,14 +70,16 @@ def test_obstacles_of_the_control_file_and_of_their_own_file_count_together(
     path = PathControl("pelvis", xz=[[0.0, 0.0], [0.0, 0.5]])
     beside = Avoid(Sphere((0.5, 0.9, 0.2), 0.2), joints=["head"])
     controls = ControlFile([path], seconds=SECONDS, text=PROMPT, obstacles=[beside])
-    inside = Avoid(Sphere((0.0, 0.9, 0.2), 2.0), margin=0.0)  # nobody gets out of it in so few steps
+    below = Avoid(
+        HalfSpace(point=(0, 3, 0), normal=(0, 1, 0)), margin=0.0
+    )  # solid, and motions stand on y = 0
     printed = command(
         "generate", "--controls", save_controls(controls, tmp_path / "walk.json"),
-        "--obstacles", save_controls(ControlFile(obstacles=[inside]), tmp_path / "scene.json"),
+        "--obstacles", save_controls(ControlFile(obstacles=[below]), tmp_path / "scene.json"),
         "--preset", "fast", "--formats", "npz", "--out", tmp_path / "out", "--model", tiny_pipeline_folder,
     )  # fmt: skip
     motion = Motion.load(Path(printed.splitlines()[-1]))
-    assert [avoid.label for avoid in motion.extra["obstacles"]] == ["sphere", "sphere"]
+    assert [avoid.label for avoid in motion.extra["obstacles"]] == ["sphere", "half_space"]
     depth = penetration(motion.joints[None], motion.extra["obstacles"], motion.skeleton).item()
     assert depth > 0.1
     assert float(printed.splitlines()[2].split()[2]) == pytest.approx(depth / CENTIMETRE, abs=PRINTED)
