@@ -117,7 +117,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--model", type=Path, help="model folder; by default the one that ships")
-    parser.add_argument("--preset", default="accurate")
+    parser.add_argument("--preset", default="balanced")
     parser.add_argument("--published", action="store_true", help="every prompt acts on the whole clip")
     parser.add_argument("--out", type=Path, default=Path("out/timelines"))
     arguments = parser.parse_args()

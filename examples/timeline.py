@@ -1,6 +1,6 @@
 """Legs and arm with prompts of their own, and a chain of three clips.
 
-python examples/timeline.py [--model FOLDER] [--preset balanced]
+python examples/timeline.py [--model FOLDER] [--preset accurate]
 """
 
 import argparse
@@ -9,7 +9,7 @@ from controlmm import ControlMM, TimelineEntry
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--model", help="model folder; by default the one that ships")
-parser.add_argument("--preset", default="accurate")
+parser.add_argument("--preset", default="balanced")
 arguments = parser.parse_args()
 pipeline = ControlMM.from_pretrained(arguments.model)
 

@@ -7,7 +7,7 @@ import torch
 
 from controlmm.controls import Avoid, Capsule, HalfSpace, Objective, Sphere
 from controlmm.generation.objective import ControlObjective
-from controlmm.generation.terms import ObjectiveTerm, OnFloor, obstacle_terms
+from controlmm.generation.terms import HeldTerm, ObjectiveTerm, OnFloor, obstacle_terms
 from controlmm.motion.skeleton import HUMANML3D, KIT
 
 ORIGIN = torch.tensor([1.0, 0.0, -2.0])
@@ -63,6 +63,16 @@ def test_kit_obstacles_are_turned_into_millimetres():
     joints = torch.full((2, 8, 21, 3), 9e3)
     joints[0, 0, 20] = torch.tensor([0.0, 900.0, 0.0])  # a joint without children
     torch.testing.assert_close(term.values(joints), torch.tensor([400.0, 0.0]))
+
+
+def test_held_poses_are_the_mean_squared_error_of_their_coordinates():
+    targets = JOINTS.clone()
+    targets[0, 2, 5] += 0.3
+    mask = torch.zeros(JOINTS.shape, dtype=torch.bool)
+    mask[:, 2, 4:6] = True
+    term = HeldTerm(targets, mask)
+    torch.testing.assert_close(term.values(JOINTS), torch.tensor([0.045, 0.0]))  # half of 0.09
+    assert term.select(torch.tensor([1])).values(JOINTS[1:]).item() == 0
 
 
 def test_an_objective_sees_exactly_its_clips_frames_in_the_callers_world():

@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from controlmm.controls import Avoid, Objective
 from controlmm.controls.shape_fields import placed, spread
 from controlmm.motion.body_points import body_points
 from controlmm.motion.skeleton import Skeleton
-from controlmm.ops import PackedObstacles, obstacle_loss, pack_obstacles
+from controlmm.ops import PackedObstacles, masked_consistency_loss, obstacle_loss, pack_obstacles
 
 OBSTACLE_WEIGHT = 0.003  # m^2 of squared error for each metre of summed depth
 _METRE = {"m": 1.0, "mm": 1000.0}  # in a skeleton's unit
@@ -96,6 +96,30 @@ class ObjectiveTerm:
     def select(self, clips: Int[Tensor, " N"]) -> ObjectiveTerm:
         """See :class:`JointTerm`."""
         return replace(self, lengths=self.lengths[clips])
+
+
+@dataclass(frozen=True, eq=False)
+class HeldTerm:
+    """Mean squared error of joints that stay where they were, in m^2: targets that only editing sees.
+
+    The control branch takes poses that are held all around an interval as a reason to go on as before; with
+    those in a term it follows the text.
+
+    Attributes:
+        targets: (B, T, J, 3) in the networks' frame, T the padded frames.
+        mask: (B, T, J, 3) what is held.
+    """
+
+    targets: Float[Tensor, "B T J 3"]
+    mask: Bool[Tensor, "B T J 3"]
+
+    def values(self, joints: Float[Tensor, "B T J 3"]) -> Float[Tensor, "B"]:
+        """See :class:`JointTerm`."""
+        return masked_consistency_loss(joints, self.targets, self.mask, norm="mse", reduction="clip")
+
+    def select(self, clips: Int[Tensor, " N"]) -> HeldTerm:
+        """See :class:`JointTerm`."""
+        return HeldTerm(self.targets[clips], self.mask[clips])
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 import torch
@@ -18,6 +19,7 @@ from controlmm.controls import Avoid, Control, Obstacle, TimelineEntry, check_ti
 from controlmm.generation.noise import clip_seeds
 from controlmm.generation.objective import control_error
 from controlmm.generation.solvers import Progress
+from controlmm.generation.terms import HeldTerm
 from controlmm.motion.ground import grounded
 from controlmm.motion.skeleton import Skeleton
 from controlmm.ops import recover_joints
@@ -65,62 +67,98 @@ def run_timeline(
         skeleton=pipeline.skeleton,
         max_frames=pipeline.longest,
     )
-    joints: Tensor | None = None  # of the latest pass
-    for index, entry in enumerate(entries):
-        length = entry.end if index == 0 else frames
-        targets, mask = scene_targets(scene, samples, length)
-        if joints is not None:
-            so_far, known = entries[: index + 1], len(joints[0])
-            pinned = _pinned(so_far, known, length, pipeline.skeleton, hold_rest=hold_rest)
-            pinned = pinned[..., None] & ~mask
-            held = nn.functional.pad(joints, (0, 0, 0, 0, 0, length - known))
-            targets, mask = torch.where(pinned, held, targets), mask | pinned
-        on_floor = not mask[..., 1].any()
-        latents = pipeline.generate_latents(
-            pipeline.text_encoder.encode([entry.prompt]).pooled.expand(samples, -1),
-            lengths=[length] * samples,
-            targets=targets,
-            mask=mask,
+    latest: _Pass | None = None
+    for index in range(len(entries)):
+        latest = _run_pass(
+            pipeline,
+            scene,
+            entries[: index + 1],
+            latest,
             seeds=[(clip + index * _PASS_SEED) % 2**63 for clip in clip_seeds(seed, samples)],
             preset=preset,
-            terms=scene.terms(
-                samples,
-                padded=pipeline.padded_frames(length),
-                skeleton=pipeline.skeleton,
-                frames=length,
-                on_floor=on_floor,
-            ),
+            hold_rest=hold_rest,
             progress=progress,
         )
-        features = pipeline.decoder.features(latents)[:, :length]
-        if on_floor:
-            features = grounded(features)
-        joints = recover_joints(features, joints=pipeline.skeleton.num_joints)
-    result = scene.result(features, latents, seconds_taken=time.perf_counter() - started, on_floor=False)
+    assert latest is not None  # there is an entry
+    taken = time.perf_counter() - started
+    result = scene.result(latest.features, latest.latents, seconds_taken=taken, on_floor=False)
     for motion in result:
         motion.extra["timeline"] = entries
-    error = control_error(recover_joints(features, joints=pipeline.skeleton.num_joints), targets, mask)
-    return dataclasses.replace(result, control_error=error)
+    return dataclasses.replace(result, control_error=latest.error)
 
 
-def scene_targets(
-    scene: Scene, samples: int, length: int
-) -> tuple[Float[Tensor, "B T J 3"], Bool[Tensor, "B T J 3"]]:
-    """The caller's own targets, for each sample, in the first ``length`` frames."""
+@dataclass(frozen=True, eq=False)
+class _Pass:
+    """What one pass made: features and joints in the networks' frame, and how well it held what it had to."""
+
+    latents: Float[Tensor, "B L C"]
+    features: Float[Tensor, "B T D"]
+    joints: Float[Tensor, "B T J 3"]
+    error: Float[Tensor, "B"]
+
+
+def _run_pass(
+    pipeline: MotionPipeline[Plan],
+    scene: Scene,
+    entries: Sequence[TimelineEntry],
+    before: _Pass | None,
+    *,
+    seeds: Sequence[int],
+    preset: Plan,
+    hold_rest: bool,
+    progress: Progress | None,
+) -> _Pass:
+    """The pass of the last of ``entries``; the first one is as long as its entry, the others as the scene."""
+    length = entries[-1].end if before is None else scene.frames
+    samples, skeleton = len(seeds), pipeline.skeleton
     canonical = scene.canonical
     targets = canonical.targets[:length].expand(samples, -1, -1, -1)
-    return targets, canonical.mask[:length].expand(samples, -1, -1, -1)
+    mask = canonical.mask[:length].expand(samples, -1, -1, -1)
+    rest = torch.zeros_like(mask)
+    if before is not None:
+        known = before.joints.shape[1]
+        held = nn.functional.pad(before.joints, (0, 0, 0, 0, 0, length - known))
+        parts = _parts_of(entries[:-1], known, length, skeleton)[..., None] & ~mask
+        targets, mask = torch.where(mask, targets, held), mask | parts
+        if hold_rest:
+            rest = _outside(entries[-1], known, length)[:, None, None] & ~mask
+    everything = mask | rest
+    on_floor = not everything[..., 1].any()
+    padded = pipeline.padded_frames(length)
+    terms = scene.terms(samples, padded=padded, skeleton=skeleton, frames=length, on_floor=on_floor)
+    if rest.any():
+        missing = (0, 0, 0, 0, 0, padded - length)
+        terms = (*terms, HeldTerm(nn.functional.pad(targets, missing), nn.functional.pad(rest, missing)))
+    latents = pipeline.generate_latents(
+        pipeline.text_encoder.encode([entries[-1].prompt]).pooled.expand(samples, -1),
+        lengths=[length] * samples,
+        targets=targets,
+        mask=mask,
+        seeds=seeds,
+        preset=preset,
+        terms=terms,
+        progress=progress,
+    )
+    features = pipeline.decoder.features(latents)[:, :length]
+    if on_floor:
+        features = grounded(features)
+    joints = recover_joints(features, joints=skeleton.num_joints)
+    return _Pass(latents, features, joints, control_error(joints, targets, everything))
 
 
-def _pinned(
-    entries: Sequence[TimelineEntry], known: int, length: int, skeleton: Skeleton, *, hold_rest: bool
+def _parts_of(
+    entries: Sequence[TimelineEntry], known: int, length: int, skeleton: Skeleton
 ) -> Bool[Tensor, "T J"]:
-    """What the pass of the last entry keeps: the parts of earlier ones, and all outside its own interval."""
+    """Parts of earlier entries in their intervals, as far as there are frames."""
     pinned = torch.zeros(length, skeleton.num_joints, dtype=torch.bool)
-    for entry in entries[:-1]:
+    for entry in entries:
         pinned[entry.start : entry.end, list(part_joints(entry.part, skeleton))] = True
-    if hold_rest:
-        pinned[: max(0, entries[-1].start - TRANSITION)] = True
-        pinned[entries[-1].end + TRANSITION :] = True
-    pinned[known:] = False  # no pass has made these frames yet
+    pinned[known:] = False
     return pinned
+
+
+def _outside(entry: TimelineEntry, known: int, length: int) -> Bool[Tensor, "T"]:
+    """Frames outside an entry, but for a transition, as far as there are any."""
+    frames = torch.arange(length)
+    beside = (frames < entry.start - TRANSITION) | (frames >= entry.end + TRANSITION)
+    return beside & (frames < known)
