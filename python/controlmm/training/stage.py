@@ -19,6 +19,7 @@ from controlmm.models.tokenizer import MotionTokenizer
 from controlmm.motion.normalizer import ROOT_CONTACT_BIAS, Normalizer
 from controlmm.text import TextEncoder, encode_all
 from controlmm.training.augmentation import Augmentation, augmented
+from controlmm.training.level_ground import ClipSelection, select
 from controlmm.training.recipe import Recipe, Sample
 from controlmm.training.settings import TrainingSettings
 from controlmm.training.tokens import MIN_FRAMES, TokenSampler
@@ -37,14 +38,15 @@ class StageInputs:
     text_encoder: TextEncoder | None = None  # set for stages that use text
     options: Any = None  # the stage's own, see `Stage.options`
     augmentation: Augmentation = field(default_factory=Augmentation)
+    selection: ClipSelection = field(default_factory=ClipSelection)
     progress: bool = True
     start: Path | None = None  # folder of the weights that the network starts from
     writes: bool = True  # whether this process may write into the root; one of those that train together may
 
     @cached_property
     def recorded_clips(self) -> list[FeatureClip]:
-        """The clips of the training split as they were recorded."""
-        return list(self.folder.clips("train", progress=self.progress))
+        """The clips of the training split as they were recorded, those that the selection takes."""
+        return select(list(self.folder.clips("train", progress=self.progress)), self.selection)
 
     @cached_property
     def train_clips(self) -> list[FeatureClip]:

@@ -14,6 +14,7 @@ from controlmm.nn.checkpoint import CONFIG_FILE, WEIGHTS_FILE, read_config
 from controlmm.text import TextEncoder
 from controlmm.training.augmentation import Augmentation
 from controlmm.training.changes import with_changes
+from controlmm.training.level_ground import ClipSelection
 from controlmm.training.loop import train
 from controlmm.training.processes import Processes
 from controlmm.training.provenance import clip_table, data_identity, file_hash
@@ -59,7 +60,8 @@ def train_stage(
         text_encoder: Needed by stages that use text; its features are cached beside the data.
         changes: Fields of :class:`TrainingSettings` to override.
         options: Fields to change of the network's configuration, of the stage's own options, of its settings
-            or of :class:`controlmm.training.augmentation.Augmentation`, written as on the command line:
+            of :class:`controlmm.training.augmentation.Augmentation` or of
+            :class:`controlmm.training.level_ground.ClipSelection`, written as on the command line:
             ``{"masks": "cross", "joined_share": "0.5"}``.
         start_from: Train given weights further: a network's folder, or the folder of a whole model, which
             also lends the earlier stages that ``root`` lacks (they are copied there). The network keeps its
@@ -82,7 +84,13 @@ def train_stage(
     if start_from is not None:
         start = starting_folder(Path(start_from), stage)
         config = read_config(start / CONFIG_FILE, type(config))
-    parts = {"config": config, "options": stage.options, "settings": settings, "data": Augmentation()}
+    parts = {
+        "config": config,
+        "options": stage.options,
+        "settings": settings,
+        "data": Augmentation(),
+        "selection": ClipSelection(),
+    }
     parts = with_changes(parts, options or {})
     settings = parts["settings"]
     inputs = StageInputs(
@@ -91,6 +99,7 @@ def train_stage(
         text_encoder=text_encoder,
         options=parts["options"],
         augmentation=parts["data"],
+        selection=parts["selection"],
         progress=progress,
         start=start,
         writes=team.is_first,
