@@ -1,19 +1,44 @@
 #include "parallel.h"
 
 #include <algorithm>
+#include <atomic>
+#include <memory>
 #include <system_error>
 #include <thread>
-#include <vector>
 
 namespace controlmm {
 namespace {
 
-// Starting and joining a thread costs about 12 us; below this share it is not worth it.
+// A thread begins about 45 us after it was started, on a busy machine milliseconds; below this share of the work it
+// is not worth it.
 constexpr double kSmallestShareNs = 150e3;
+constexpr int kChunksPerWorker = 4;  // so that a worker that began late, or on a slow core, takes fewer
 
-ClipRange share_of(std::int64_t clips, int workers, int worker) {
-  return {clips * worker / workers, clips * (worker + 1) / workers};
-}
+// What is left of a call's work. The caller and its threads take chunks of clips until none is left. It may outlive the
+// call: a thread that begins after all is done finds no chunk, and never touches `work`.
+class Chunks {
+ public:
+  Chunks(std::int64_t clips, int count, const std::function<void(ClipRange, int)>& work)
+      : clips_(clips), count_(count), work_(&work) {}
+
+  void take_all(int worker) {
+    for (int chunk = next_.fetch_add(1); chunk < count_; chunk = next_.fetch_add(1)) {
+      (*work_)({clips_ * chunk / count_, clips_ * (chunk + 1) / count_}, worker);
+      done_.fetch_add(1, std::memory_order_release);
+    }
+  }
+
+  // The last chunks are a small part of the call, so sleeping would take longer than they do.
+  void wait() const {
+    while (done_.load(std::memory_order_acquire) < count_) std::this_thread::yield();
+  }
+
+ private:
+  const std::int64_t clips_;
+  const int count_;
+  const std::function<void(ClipRange, int)>* const work_;
+  std::atomic<int> next_{0}, done_{0};
+};
 
 }  // namespace
 
@@ -25,18 +50,16 @@ int useful_threads(int threads, std::int64_t clips, double work_ns) {
 }
 
 void for_clip_ranges(std::int64_t clips, int workers, const std::function<void(ClipRange, int)>& work) {
-  std::vector<std::thread> threads;
-  threads.reserve(static_cast<std::size_t>(workers - 1));
-  int started = 1;
+  const int count = static_cast<int>(std::min<std::int64_t>(clips, std::int64_t{workers} * kChunksPerWorker));
+  const auto chunks = std::make_shared<Chunks>(clips, count, work);
   try {
-    for (; started < workers; ++started)
-      threads.emplace_back([&work, clips, workers, started] { work(share_of(clips, workers, started), started); });
+    for (int worker = 1; worker < workers; ++worker)
+      std::thread([chunks, worker] { chunks->take_all(worker); }).detach();
   } catch (const std::system_error&) {
-    // The system gives no more threads: the caller does the remaining shares itself.
+    // The system gives no more threads: those that there are, and the caller, do everything.
   }
-  work(share_of(clips, workers, 0), 0);
-  for (int worker = started; worker < workers; ++worker) work(share_of(clips, workers, worker), worker);
-  for (std::thread& thread : threads) thread.join();
+  chunks->take_all(0);
+  chunks->wait();
 }
 
 }  // namespace controlmm
