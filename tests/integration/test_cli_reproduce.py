@@ -8,8 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from controlmm.cli.reproduce import _all_names
+from controlmm.evaluation.controlmm_tables import Study
 from controlmm.evaluation.published_tables import published_table
-from controlmm.pipelines import PRESETS
+from controlmm.pipelines import PRESETS, ControlMM
 
 PNG = b"\x89PNG"
 
@@ -78,7 +80,7 @@ def test_confidence_has_five_maps(
 
 @pytest.mark.parametrize(
     ("table", "published", "ours"),
-    [("tl-table3", 2, 2), ("tl-fig7", 0, 12)],
+    [("tl-table3", 2, 2), ("tl-fig7", 0, 12), ("tl-supplement2", 4, 8)],
 )
 def test_tables_of_tlcontrol_have_both_models(
     command: Callable[..., str],
@@ -112,3 +114,40 @@ def test_refusals(
     refused: Callable[..., str], arguments: list[object], table: str, extra: list[str], message: str
 ) -> None:
     assert message in refused("reproduce", table, *arguments, *extra)
+
+
+def test_all_tables_share_what_they_have_in_common_and_say_how_long_they_took(
+    command: Callable[..., str],
+    arguments: list[object],
+    tiny_tlcontrol_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    chosen = ["table3", "table5", "table8", "tl-table1", "tl-fig7"]
+    monkeypatch.setattr("controlmm.cli.reproduce._all_names", lambda _: chosen)
+    arguments += ["--tlcontrol", tiny_tlcontrol_folder, "--preset", "fast"]
+    printed = command("reproduce", "all", *arguments)
+    for name in chosen:
+        assert f"| [{name}]({name}) | " in printed
+        assert list((tmp_path / "out" / name).glob("*.md"))
+    assert (tmp_path / "out" / "README.md").read_text() in printed
+    kept = list((tmp_path / "out" / "batches").iterdir())
+    # The paper's Accurate is in three tables, its Medium in two; all six whole paths in two, twice.
+    assert len(kept) == 8 + (4 - 2) + (6 - 1) + 15 + (12 - 2)
+    files = {file: file.stat().st_mtime_ns for file in (tmp_path / "out").rglob("*.safetensors")}
+    command("reproduce", "table3", *arguments)
+    assert {file: file.stat().st_mtime_ns for file in (tmp_path / "out").rglob("*.safetensors")} == files
+
+
+def test_all_is_every_table_of_the_skeleton(tiny_pipeline: ControlMM) -> None:
+    names = _all_names(Study(tiny_pipeline))
+    assert len(names) == len(set(names)) == 9 + 1 + 5
+    assert not {"table10", "tl-table2"} & set(names)
+
+
+def test_incomplete_batches_of_other_limits_are_other_rows(
+    command: Callable[..., str], arguments: list[object], tmp_path: Path
+) -> None:
+    command("reproduce", "table2", *arguments, "--limit", "1")
+    command("reproduce", "table2", *arguments)  # two clips
+    assert len(list((tmp_path / "out" / "batches").iterdir())) == 4

@@ -213,3 +213,40 @@ def test_results_are_written_for_people_and_programs(
     assert content["rows"][2]["metrics"]["average_joint"]["repeats"] == [
         pytest.approx(scores[2]["average_joint"].mean, abs=1e-6)
     ]
+
+
+def test_multimodality_is_of_thirty_motions_that_differ_in_noise_alone(
+    tiny_pipeline: ControlMM, test_set: TestSet, evaluator: Evaluator, tmp_path: Path
+) -> None:
+    class Copied(Generated):
+        """Motions that no noise changes."""
+
+        def motions(self, batch: Batch) -> Produced:
+            return super().motions(dataclasses.replace(batch, noise_seeds=[0] * len(batch.samples)))
+
+    def varied(source: Generated, name: str, repeats: int = 1) -> Sequence[float]:
+        rows = [Row("real motion", RealMotion()), Row("quick", source)]
+        protocol = Protocol(repeats, multimodality=4)
+        real, quick = evaluate_rows(rows, test_set, evaluator, protocol, tmp_path / name, progress=False)
+        assert "multimodality" not in real.repeats
+        text = ResultPage("title", {}, [real, quick], "").markdown()
+        assert "| Diversity → | Multimodality ↑ |" in text
+        return quick.repeats["multimodality"]
+
+    first, second = varied(Generated(tiny_pipeline, QUICK), "drawn", repeats=2)
+    assert first > 0
+    assert first != second
+    assert varied(Generated(tiny_pipeline, QUICK), "drawn") == [first]  # from the files
+    (nothing,) = varied(Copied(tiny_pipeline, QUICK), "copied")
+    assert nothing == pytest.approx(0, abs=ROUNDING)
+
+
+def test_joints_are_controlled_together_by_their_names(
+    tiny_pipeline: ControlMM, test_set: TestSet, evaluator: Evaluator, tmp_path: Path
+) -> None:
+    rows = [Row("real motion", RealMotion(), ControlSetting("left_wrist+head+pelvis", 5))]
+    (real,) = evaluate_rows(rows, test_set, evaluator, Protocol(), tmp_path, progress=False)
+    assert real["keys"].mean == 3 * 5
+    assert real["average_of_head"].mean == 0
+    with pytest.raises(ValueError, match=r"several joined by '\+', or one of random"):
+        ControlSetting("head+cross").check(test_set.skeleton)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,8 +11,10 @@ import torch
 
 from controlmm.evaluation.confidence import confidence_records
 from controlmm.evaluation.control_draws import ControlSetting, draw_mask
+from controlmm.evaluation.control_errors import control_errors
 from controlmm.evaluation.controlmm_tables import TABLES, Study, without_control_model
 from controlmm.evaluation.motion_sources import Batch, Generated
+from controlmm.evaluation.optimized_codes import OptimizedCodes
 from controlmm.evaluation.random_streams import stream
 from controlmm.evaluation.reproduction import mean_of
 from controlmm.evaluation.scores import RowScores
@@ -20,7 +23,8 @@ from controlmm.evaluation.tlcontrol_tables import TABLES as TL_TABLES
 from controlmm.evaluation.tlcontrol_tables import Duel
 from controlmm.generation.editing import EditingBudget
 from controlmm.motion.skeleton import HUMANML3D
-from controlmm.pipelines import PRESETS, ControlMM, Preset, TLControl
+from controlmm.ops import recover_joints
+from controlmm.pipelines import PRESETS, ControlMM, Preset, TLControl, TLControlPreset
 
 PLAIN = Preset(EditingBudget(latent_iterations=0), steps=2)
 ROUNDING = 1e-4  # of joints in metres, float32
@@ -70,7 +74,7 @@ def test_the_ablation_has_the_papers_eight_cases(tiny_pipeline: ControlMM) -> No
 
 METRICS = (
     "r1", "r2", "r3", "fid", "mm_distance", "diversity", "skating_published", "trajectory_50_joint",
-    "location_50_joint", "average_joint", "seconds", "frames",
+    "location_50_joint", "average_joint", "seconds", "frames", "feedforward", "iterations", "evaluations",
     *(f"average_of_{HUMANML3D.joint_names[joint]}" for joint in HUMANML3D.control_joints),
 )  # fmt: skip
 
@@ -79,7 +83,7 @@ METRICS = (
     ("name", "ours"),
     [
         ("table1", 9), ("table2", 2), ("table3", 8), ("table4", 5), ("table5", len(PRESETS)), ("table7", 9),
-        ("table8", 6), ("table9", 6), ("tl-table1", 15), ("tl-fig7", 12),
+        ("table8", 6), ("table9", 6), ("tl-table1", 15), ("tl-fig7", 12), ("tl-supplement2", 8),
     ],
 )  # fmt: skip
 def test_our_lines_fill_every_column_of_the_paper(
@@ -95,18 +99,20 @@ def test_our_lines_fill_every_column_of_the_paper(
     lines = table.markdown(scores).splitlines()[2 + len(table.published.rows) :]
     assert len(lines) == ours
     for line in lines:
-        assert len(line.split(" | ")) == len(table.published.columns) + 2  # who, and seconds
+        more = 2 + len(table.extra)  # who, and seconds
+        assert len(line.split(" | ")) == len(table.published.columns) + more
         assert re.search(r"\| ours \| (0\.50* \| |50\.00 \| )+", line)
 
 
 def test_accuracy_settings_stand_over_the_joints(tiny_pipeline: ControlMM, tiny_tlcontrol: TLControl) -> None:
     table = TL_TABLES["tl-table4"](Duel(tiny_tlcontrol, tiny_pipeline))
-    values = {"seconds": [0.25], "average_joint": [0.02]}
+    values = {"seconds": [0.25], "average_joint": [0.02], "iterations": [70.2], "evaluations": [75.0]}
     values |= {name: [0.01] for name in METRICS if name.startswith("average_of")}
     lines = table.markdown([RowScores(row.label, values, 32, {}) for row in table.rows]).splitlines()
     assert "| runtime per batch (s) | 8.00 | 8.00 | 8.00 | 8.00 | 8.00 |" in lines
     assert "| left hand | 1.00 | 1.00 | 1.00 | 1.00 | 1.00 |" in lines
     assert "| average | 2.00 | 2.00 | 2.00 | 2.00 | 2.00 |" in lines
+    assert "| iterations | 70 | 70 | 70 | 70 | 70 |" in lines
 
 
 def test_tables_of_kit_need_a_model_of_kit(tiny_pipeline: ControlMM, tiny_tlcontrol: TLControl) -> None:
@@ -130,3 +136,20 @@ def test_confidence_is_of_valid_tokens_only(tiny_pipeline: ControlMM, test_set: 
             assert record.steps[:, clip, :count].isfinite().all()
             assert record.steps[:, clip, count:].isnan().all()
         assert record.mean.shape == (3,)
+
+
+def test_the_optimisers_work_stands_beside_motions_that_are_those_of_a_call(
+    tiny_tlcontrol: TLControl, test_set: TestSet
+) -> None:
+    preset = TLControlPreset(tolerance=1e-5, iterations=10)
+    batch = _batch(test_set)
+    watched, plain = (source(tiny_tlcontrol, preset).motions(batch) for source in (OptimizedCodes, Generated))
+    assert torch.equal(watched.features, plain.features)
+    untouched = Generated(tiny_tlcontrol, replace(preset, iterations=0)).motions(batch)
+    joints = recover_joints(untouched.features, joints=22)
+    expected = control_errors(joints, batch.joints, batch.mask).average
+    torch.testing.assert_close(watched.numbers["feedforward"], expected, rtol=0, atol=ROUNDING)
+    steps, evaluations = watched.numbers["iterations"], watched.numbers["evaluations"]
+    assert (steps >= 1).all()
+    assert (steps <= 10).all()
+    assert (steps + 1 <= evaluations).all()  # the start, and at least one a step

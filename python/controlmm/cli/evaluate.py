@@ -50,6 +50,9 @@ def evaluate(
     mask_padding: Annotated[
         bool, typer.Option("--mask-padding", help="Hide decoded padding from the published evaluator.")
     ] = False,
+    multimodality: Annotated[
+        int, typer.Option(help="Texts that get 30 motions each, for the column multimodality.")
+    ] = 0,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
 ) -> None:
     """Measure quality, control and time; real motion is the first row of every table."""
@@ -62,7 +65,7 @@ def evaluate(
 
     started = time.perf_counter()
     setting = ControlSetting(control, int(density) if density.isdigit() else density)
-    protocol = Protocol(repeats, limit, seed, mask_padding)
+    protocol = Protocol(repeats, limit, seed, mask_padding, multimodality)
     judge = load_evaluator(evaluator)
     test_set = read_test_set(
         data, split=split, kinds=listed(captions), sources=listed(sources) if sources else None

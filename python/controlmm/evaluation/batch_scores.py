@@ -91,7 +91,7 @@ def score_batch(
         texts=evaluator.embed_captions(captions),
         real=evaluator.embed_motions(batch.real, lengths),
         motions=evaluator.embed_motions(produced.features, lengths, sees_padding=sees_padding),
-        numbers=_numbers(batch, produced),
+        numbers={**_numbers(batch, produced), **produced.numbers},
     )
 
 

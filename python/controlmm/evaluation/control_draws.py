@@ -18,6 +18,7 @@ from controlmm.motion.skeleton import Skeleton
 DENSITIES = (1, 2, 5, 49, 196)  # of 196 frames; the last two are a quarter and all of shorter clips
 EVERY_DENSITY = "all"
 GROUPS = ("random", "cross", "lower", "all", "none")  # beside the names of joints
+JOINED = "+"  # between the names of joints that are controlled together
 _PELVIS = "pelvis"  # joint 0 of every skeleton, by this name too
 _QUARTER, _WHOLE = 49, 196
 
@@ -27,8 +28,9 @@ class ControlSetting:
     """What is controlled.
 
     Attributes:
-        control: A joint's name; ``random`` (one of the six for each sample), ``cross`` (one of their 63
-            combinations for each sample), ``lower`` (pelvis and feet), ``all`` (all six), ``none``.
+        control: A joint's name, or several joined by ``+``; ``random`` (one of the six for each sample),
+            ``cross`` (one of their 63 combinations for each sample), ``lower`` (pelvis and feet), ``all``
+            (all six), ``none``.
         density: 1, 2, 5, 49 or 196 keyframes; ``"all"`` draws one of these for each sample; a fraction such
             as 0.25 takes that share of the frames (TLControl, Figure 7).
     """
@@ -38,11 +40,11 @@ class ControlSetting:
 
     def check(self, skeleton: Skeleton) -> None:
         """Raise ``ValueError`` if there is no such joint, group or density."""
-        known = (*skeleton.joint_names, _PELVIS, *GROUPS)
-        if self.control not in known:
+        joints = {*skeleton.joint_names, _PELVIS}
+        if self.control not in GROUPS and not joints.issuperset(self.control.split(JOINED)):
             raise ValueError(
-                f"`control` must be a joint ({', '.join(skeleton.joint_names)}) or one of "
-                f"{', '.join(GROUPS)}, got {self.control!r}."
+                f"`control` must be a joint ({', '.join(skeleton.joint_names)}), several joined by "
+                f"{JOINED!r}, or one of {', '.join(GROUPS)}, got {self.control!r}."
             )
         is_share = isinstance(self.density, float) and 0 < self.density <= 1
         if self.density not in (*DENSITIES, EVERY_DENSITY) and not is_share:
@@ -71,7 +73,8 @@ def draw_joints(control: str, skeleton: Skeleton, generator: torch.Generator) ->
         return six
     if control == "lower":
         return (0, skeleton.left_foot[1], skeleton.right_foot[1])
-    return (0,) if control == _PELVIS else (skeleton.joint_index(control),)
+    names = control.split(JOINED)
+    return tuple(0 if name == _PELVIS else skeleton.joint_index(name) for name in names)
 
 
 def draw_frames(density: int | float | str, length: int, generator: torch.Generator) -> Int[Tensor, "K"]:

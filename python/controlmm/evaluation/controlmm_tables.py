@@ -219,6 +219,7 @@ TABLES: dict[str, Callable[[Study], Reproduction]] = {
     maker.__name__: maker
     for maker in (table1, table2, table3, table4, table5, table6, table7, table8, table9, table10)
 }
+KIT_TABLES = ("table10",)
 
 
 def _component_seconds(scores: Sequence[RowScores]) -> tuple[list[str], list[list[str]]]:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol
 
 import torch
@@ -65,12 +65,13 @@ class Produced:
     """Features of a batch and the seconds that they took.
 
     ``features`` are (B, 196, D), de-normalised; ``has_padding`` says that a decoder wrote what lies beyond
-    the clips, which the published evaluation looks at.
+    the clips, which the published evaluation looks at; ``numbers``, (B,), are what else is worth a column.
     """
 
     features: Float[Tensor, "B T D"]
     seconds: float
     has_padding: bool
+    numbers: Mapping[str, Float[Tensor, "B"]] = field(default_factory=dict)
 
 
 class MotionSource(Protocol):
@@ -133,14 +134,7 @@ class Generated:
         """See :class:`MotionSource`. Seconds are those of text features, latents and decoding."""
         started = time.perf_counter()
         pipeline, frames = self.pipeline, frame_mask(batch.lengths, MAX_FRAMES)
-        latents = pipeline.generate_latents(
-            pipeline.text_encoder.encode([sample.caption.text for sample in batch.samples]).pooled,
-            lengths=batch.lengths.tolist(),
-            targets=batch.joints,
-            mask=batch.mask[..., None].expand_as(batch.joints),
-            seeds=batch.noise_seeds,
-            preset=self.preset,
-        )
+        latents, numbers = self.latents(batch)
         tokens = MAX_FRAMES // pipeline.decoder.downsample
         latents = torch.nn.functional.pad(latents, (0, 0, 0, tokens - latents.shape[1]))
         features = pipeline.decoder.features(latents, frames)
@@ -149,7 +143,24 @@ class Generated:
         seconds = time.perf_counter() - started
         # Beyond the clips: what the decoder makes of empty tokens, as in the published evaluation.
         padding = pipeline.decoder.features(latents)
-        return Produced(features.where(frames[..., None], padding), seconds, has_padding=True)
+        whole = features.where(frames[..., None], padding)
+        return Produced(whole, seconds, has_padding=True, numbers=numbers)
+
+    def latents(self, batch: Batch) -> tuple[Float[Tensor, "B L C"], dict[str, Float[Tensor, "B"]]]:
+        """Latents of the motions, and numbers for :class:`Produced`."""
+        return self.generated(batch, self.preset), {}
+
+    def generated(self, batch: Batch, preset: Any) -> Float[Tensor, "B L C"]:
+        """The pipeline's latents under ``preset``."""
+        pipeline = self.pipeline
+        return pipeline.generate_latents(
+            pipeline.text_encoder.encode([sample.caption.text for sample in batch.samples]).pooled,
+            lengths=batch.lengths.tolist(),
+            targets=batch.joints,
+            mask=batch.mask[..., None].expand_as(batch.joints),
+            seeds=batch.noise_seeds,
+            preset=preset,
+        )
 
     def _meet_targets(self, features: Float[Tensor, "B T D"], batch: Batch) -> None:
         """The pipeline's exact mode, clip by clip, in place."""

@@ -5,7 +5,7 @@ A killed run loses at most one batch: the same call goes on where it was stopped
 
 from __future__ import annotations
 
-import json
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
@@ -19,14 +19,13 @@ from controlmm.evaluation.batch_scores import BatchScores, score_batch
 from controlmm.evaluation.control_draws import ControlSetting, draw_mask
 from controlmm.evaluation.evaluators import Evaluator
 from controlmm.evaluation.frechet import frechet_distance
-from controlmm.evaluation.motion_sources import Batch, MotionSource, RealMotion, padded_features
+from controlmm.evaluation.motion_sources import Batch, Generated, MotionSource, RealMotion, padded_features
+from controlmm.evaluation.multimodality import MOTIONS, row_multimodality
 from controlmm.evaluation.random_streams import stream
 from controlmm.evaluation.retrieval import GROUP
+from controlmm.evaluation.row_folders import labelled_folders, shared_folders
 from controlmm.evaluation.scores import RowScores, repeat_scores
 from controlmm.evaluation.test_set import MAX_FRAMES, Sample, TestSet
-from controlmm.io.atomic import replaced_on_success
-
-ROW_FILE = "row.json"
 
 
 @dataclass(frozen=True)
@@ -39,24 +38,35 @@ class Protocol:
             one incomplete batch, for which R-precision is not defined.
         seed: Of all draws.
         mask_padding: See :func:`controlmm.evaluation.batch_scores.score_batch`.
+        multimodality: Texts for which generated rows make 30 motions each, rounded down to whole batches of
+            32 as ``limit``; the papers take 100. 0 leaves multimodality out.
     """
 
     repeats: int = 1
     limit: int | None = None
     seed: int = 0
     mask_padding: bool = False
+    multimodality: int = 0
 
     def __post_init__(self) -> None:
         for name, value in (("repeats", self.repeats), ("limit", self.limit)):
             if value is not None and value < 1:
                 raise ValueError(f"`{name}` must be at least 1, got {value}.")
-        if self.seed < 0:
-            raise ValueError(f"`seed` must not be negative, got {self.seed}.")
+        for name in ("seed", "multimodality"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"`{name}` must not be negative, got {getattr(self, name)}.")
 
     def clips(self, available: int) -> int:
         """Samples in a repeat when there are ``available``."""
-        count = available if self.limit is None else min(self.limit, available)
-        return count // GROUP * GROUP or count
+        return _whole_groups(available if self.limit is None else min(self.limit, available))
+
+    def batches(self, available: int) -> int:
+        """Batches of a repeat."""
+        return -(-self.clips(available) // GROUP)
+
+    def varied_batches(self, available: int) -> int:
+        """Batches of a repeat whose texts get several motions."""
+        return -(-_whole_groups(min(self.multimodality, self.clips(available))) // GROUP)
 
 
 @dataclass(frozen=True)
@@ -75,6 +85,7 @@ def evaluate_rows(
     protocol: Protocol,
     out: str | Path,
     *,
+    is_shared: bool = False,
     progress: bool = True,
 ) -> list[RowScores]:
     """Scores of all rows, on the same samples; those with the same setting also meet the same targets.
@@ -85,6 +96,8 @@ def evaluate_rows(
         evaluator: Makes the embeddings; must take the features of ``test_set``.
         protocol: Repeats, limit, seed.
         out: Folder for a file a batch; what is there already is not computed again.
+        is_shared: Whether batches are kept by what they are instead of by the row's label: then tables with
+            equal rows share them, and a folder may hold evaluations of any settings.
         progress: Show a progress bar.
 
     Raises:
@@ -96,22 +109,32 @@ def evaluate_rows(
         raise ValueError(
             f"The evaluator takes features of width {evaluator.feature_dim}, the data has {width}."
         )
-    folders = _folders(rows, Path(out))
+    available = len(test_set.items)
     shared = {
-        "protocol": _identity(protocol), "data": test_set.sha256, "captions": list(test_set.kinds),
-        "split": test_set.split, "evaluator": evaluator.name,
+        "protocol": _identity(protocol, available), "data": test_set.sha256,
+        "captions": list(test_set.kinds), "split": test_set.split, "evaluator": evaluator.name,
     }  # fmt: skip
-    abouts = []
-    for row, folder in zip(rows, folders, strict=True):
+    for row in rows:
         row.setting.check(test_set.skeleton)
-        abouts.append({"label": row.label, **row.source.describe(), **asdict(row.setting)})
-        _claim(folder, {**abouts[-1], **shared})
-    batches = -(-protocol.clips(len(test_set.items)) // GROUP)
-    with tqdm(total=len(rows) * protocol.repeats * batches, unit="batch", disable=not progress) as bar:
+    whats = [{**row.source.describe(), **asdict(row.setting)} for row in rows]
+    labels, claims, root = (
+        [row.label for row in rows],
+        [what | shared for what in whats],
+        Path(out) / "batches",
+    )
+    folders = shared_folders(claims, root) if is_shared else labelled_folders(labels, claims, root)
+    steps = sum(_steps(row, protocol, available) for row in rows)
+    with tqdm(total=steps, unit="batch", disable=not progress) as bar:
         return [
-            _evaluate_row(row, about, test_set, evaluator, protocol, folder, bar)
-            for row, about, folder in zip(rows, abouts, folders, strict=True)
+            _evaluate_row(row, {"label": row.label, **what}, test_set, evaluator, protocol, folder, bar)
+            for row, what, folder in zip(rows, whats, folders, strict=True)
         ]
+
+
+def _steps(row: Row, protocol: Protocol, available: int) -> int:
+    """Times that the row has motions made."""
+    varied = MOTIONS * protocol.varied_batches(available) if isinstance(row.source, Generated) else 0
+    return protocol.repeats * (protocol.batches(available) + varied)
 
 
 def batches_of(
@@ -161,11 +184,45 @@ def _evaluate_row(
             found.append(scores)
             bar.update()
         values = repeat_scores(found, seed=protocol.seed, repeat=repeat)
+        if isinstance(row.source, Generated) and protocol.multimodality:
+            values["multimodality"] = _multimodality(row, test_set, evaluator, protocol, folder, repeat, bar)
         if isinstance(row.source, RealMotion):
             values["fid"] = _fid_of_another_draw(test_set, evaluator, protocol, repeat, found)
         for name, value in values.items():
             repeats.setdefault(name, []).append(value)
     return RowScores(row.label, repeats, protocol.clips(len(test_set.items)), about)
+
+
+def _multimodality(
+    row: Row,
+    test_set: TestSet,
+    evaluator: Evaluator,
+    protocol: Protocol,
+    folder: Path,
+    repeat: int,
+    bar: Any,
+) -> float:
+    bar.set_description(f"{row.label}, multimodality")
+    pairs = batches_of(test_set, row.setting, protocol, repeat)
+    batches = (
+        Batch.of(*zip(*batch, strict=True), seed=protocol.seed, repeat=repeat)
+        for batch in itertools.islice(pairs, protocol.varied_batches(len(test_set.items)))
+    )
+    return row_multimodality(
+        row.source,
+        batches,
+        evaluator,
+        folder,
+        seed=protocol.seed,
+        repeat=repeat,
+        mask_padding=protocol.mask_padding,
+        done=bar.update,
+    )
+
+
+def _whole_groups(count: int) -> int:
+    """``count`` rounded down to whole groups, unless it is less than one."""
+    return count // GROUP * GROUP or count
 
 
 def _fid_of_another_draw(
@@ -188,37 +245,10 @@ def _fid_of_another_draw(
     return frechet_distance(torch.cat([batch.real for batch in batches]), torch.cat(embeddings))
 
 
-def _identity(protocol: Protocol) -> dict[str, Any]:
-    """All but the number of repeats: more of them go on where fewer ended."""
+def _identity(protocol: Protocol, available: int) -> dict[str, Any]:
+    """What decides a batch: neither how many repeats there are, nor how many whole batches."""
     fields = asdict(protocol)
-    del fields["repeats"]
+    del fields["repeats"], fields["multimodality"]
+    if protocol.clips(available) % GROUP == 0:
+        fields["limit"] = None
     return fields
-
-
-def _folders(rows: Sequence[Row], out: Path) -> list[Path]:
-    names = ["".join(c if c.isalnum() else "-" for c in row.label.lower()).strip("-") for row in rows]
-    if len(set(names)) < len(names):
-        raise ValueError(f"Rows must have different labels, got {', '.join(row.label for row in rows)}.")
-    return [out / "batches" / name for name in names]
-
-
-def _claim(folder: Path, about: dict[str, Any]) -> None:
-    """Write down what the folder holds, or check that it holds just that."""
-    file = folder / ROW_FILE
-    text = json.dumps(about, indent=2, sort_keys=True) + "\n"
-    if file.is_file():
-        try:
-            before = json.loads(file.read_text(encoding="utf-8"))
-        except json.JSONDecodeError:
-            before = {}
-        now = json.loads(text)
-        changed = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
-        if changed:
-            raise ValueError(
-                f"{folder} holds an evaluation with another {', '.join(changed)}. Go on with the same "
-                "settings or choose another `--out`."
-            )
-        return
-    folder.mkdir(parents=True, exist_ok=True)
-    with replaced_on_success(file) as partial:
-        partial.write_text(text, encoding="utf-8")

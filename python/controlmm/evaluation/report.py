@@ -41,6 +41,7 @@ QUALITY = (
     Column("MM-Dist ↓", "mm_distance"),
     Column("Diversity →", "diversity"),
 )
+MULTIMODALITY = Column("Multimodality ↑", "multimodality")  # where it was measured
 CONTROL = (
     Column("R@3 ↑", "r3"),
     Column("FID ↓", "fid"),
@@ -100,13 +101,17 @@ class ResultPage:
         tables = [
             f"## {heading}\n\n{markdown_table(self.rows, columns)}"
             for heading, columns in (
-                ("Text", QUALITY), ("Control", CONTROL), ("Control, other counts", MORE_CONTROL),
+                ("Text", self._quality()), ("Control", CONTROL), ("Control, other counts", MORE_CONTROL),
                 ("Motion", PHYSICS),
             )
         ]  # fmt: skip
         if self.codes:
             tables.append(f"## Codes of the tokenizer\n\n{codes_table(self.codes)}")
         return "\n\n".join([f"# {self.title}", facts, *tables, self.caution]) + "\n"
+
+    def _quality(self) -> tuple[Column, ...]:
+        is_measured = any(MULTIMODALITY.metric in row.repeats for row in self.rows)
+        return (*QUALITY, MULTIMODALITY) if is_measured else QUALITY
 
 
 def codes_table(codes: Mapping[str, CodeStatistics]) -> str:

@@ -49,6 +49,7 @@ class Reproduction:
         average: Keys of a line that is the mean of lines, and the numbers of those.
         own_table: For tables that are not a line a system: makes titles and lines of ours from the scores.
         columns: For figures, whose numbers the paper does not give: titles of our columns.
+        extra: Columns of ours that the paper does not have.
         notes: Sentences for the foot.
     """
 
@@ -57,6 +58,7 @@ class Reproduction:
     average: tuple[tuple[str, ...], Sequence[int]] | None = None
     own_table: Callable[[Sequence[RowScores]], tuple[list[str], list[list[str]]]] | None = None
     columns: tuple[str, ...] = ()
+    extra: Sequence[Column] = ()
     notes: Sequence[str] = ()
 
     @property
@@ -84,14 +86,16 @@ class Reproduction:
             return f"Published:\n\n{theirs}\n\nOurs:\n\n{pipe_table(titles, cells)}"
         columns = [_METRICS[title] for title in published.columns if title in _METRICS]
         keys = [title for title in published.columns if title not in _METRICS]
-        titles = [*keys, "", *(column.title for column in columns), SECONDS.title]
+        own = [*columns, SECONDS, *self.extra]
+        titles = [*keys, "", *(column.title for column in own)]
+        blank = [""] * (len(own) - len(columns))
         theirs_cells = [
-            [*row[: len(keys)], "published", *_ordered(published, row, columns), ""] for row in published.rows
+            [*row[: len(keys)], "published", *_ordered(published, row, columns), *blank]
+            for row in published.rows
         ]
-        found = self._with_average(scores)
         ours = [
-            [*line_keys, "ours", *(column.cell(score) for column in columns), SECONDS.cell(score)]
-            for line_keys, score in found
+            [*line_keys, "ours", *(column.cell(score) for column in own)]
+            for line_keys, score in self._with_average(scores)
         ]
         return pipe_table(titles, theirs_cells + ours)
 

@@ -6,9 +6,11 @@ TLControl optimises its codes so (Wan et al., ECCV 2024); their tolerance, the "
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from functools import partial
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -59,33 +61,44 @@ def lbfgs(
         tolerance: When to stop for want of progress.
         progress: Called after every evaluation.
     """
+    steps: list[int] = []
     search = partial(
         _search,
+        steps=steps,
         iterations=stopping.iterations,
         rate=rate,
         history=history,
         tolerance=tolerance or LbfgsTolerance(),
     )
-    return run_searches(search, objective, latents, keep, stopping, progress=progress)
+    solution = run_searches(search, objective, latents, keep, stopping, progress=progress)
+    return dataclasses.replace(solution, iterations=torch.tensor(steps, dtype=torch.int64))
 
 
 def _search(
-    start: Float[Tensor, "N"], *, iterations: int | None, rate: float, history: int, tolerance: LbfgsTolerance
+    start: Float[Tensor, "N"],
+    *,
+    steps: list[int],
+    iterations: int | None,
+    rate: float,
+    history: int,
+    tolerance: LbfgsTolerance,
 ) -> Search:
+    """The search of the next clip; how many steps it has taken stands in a new place of ``steps``."""
     converged: Reason = "converged"
     point, memory = start, Curvature(history)
+    clip = len(steps)
+    steps.append(0)
     sample = yield point
     if sample.gradient.abs().max() <= tolerance.gradient:
         return converged
     step = min(1.0, 1 / sample.gradient.abs().sum().item()) * rate
-    done = 0
-    while iterations is None or done < iterations:
+    while iterations is None or steps[clip] < iterations:
         direction = memory.direction(sample.gradient)
         line = Line(point, direction, sample)
         if line.start.slope > -tolerance.change:
             return converged
         reached = yield from strong_wolfe(line, step)
-        done += 1
+        steps[clip] += 1
         moved, change = direction * reached.step, reached.gradient - sample.gradient
         is_still = moved.abs().max() <= tolerance.change
         if is_still or abs(reached.loss - sample.loss) < tolerance.change:

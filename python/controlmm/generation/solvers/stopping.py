@@ -88,6 +88,7 @@ class Solution:
         evaluations: (B,), how many there were.
         reasons: Why each clip stopped.
         seconds: Wall-clock time of the whole batch.
+        iterations: (B,), steps that were taken, where the solver has steps of several evaluations.
     """
 
     latents: Float[Tensor, "B L C"]
@@ -96,3 +97,4 @@ class Solution:
     evaluations: Int[Tensor, "B"]
     reasons: tuple[Reason, ...]
     seconds: float
+    iterations: Int[Tensor, "B"] | None = None
