@@ -11,10 +11,12 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import get_args
 
 from benchmarks.progress_file import Row, measured_rows
 from controlmm import ControlMM, TimelineEntry
 from controlmm.evaluation.facts import Range, measured_facts, missed
+from controlmm.pipelines.timeline import TimelineMethod
 
 Expected = Mapping[str, Range]
 _WALK: Expected = {"forward_speed": (0.4, None)}
@@ -73,11 +75,11 @@ TIMELINES: dict[str, list[tuple[str, str, float, float, Expected]]] = {
 }
 
 
-def measure(pipeline: ControlMM, name: str, *, preset: str, hold_rest: bool, pictures: Path) -> Row:
+def measure(pipeline: ControlMM, name: str, *, preset: str, method: TimelineMethod, pictures: Path) -> Row:
     """The row of a timeline: which facts of which entries hold."""
     rows = TIMELINES[name]
     entries = [TimelineEntry(part, prompt, seconds=(a, b)) for part, prompt, a, b, _ in rows]
-    result = pipeline.timeline(entries, preset=preset, hold_rest=hold_rest, seed=1)
+    result = pipeline.timeline(entries, preset=preset, method=method, seed=1)
     result.best.save(pictures / f"{name.replace(' ', '_').replace(',', '')}.png", dpi=70)
     failed = [
         f"{entry.label}: {fact}"
@@ -118,7 +120,7 @@ def main() -> None:
     )
     parser.add_argument("--model", type=Path, help="model folder; by default the one that ships")
     parser.add_argument("--preset", default="balanced")
-    parser.add_argument("--published", action="store_true", help="every prompt acts on the whole clip")
+    parser.add_argument("--method", default="tracks", choices=get_args(TimelineMethod))
     parser.add_argument("--out", type=Path, default=Path("out/timelines"))
     arguments = parser.parse_args()
     pipeline = ControlMM.from_pretrained(arguments.model)
@@ -129,12 +131,14 @@ def main() -> None:
             pipeline,
             name,
             preset=arguments.preset,
-            hold_rest=not arguments.published,
+            method=arguments.method,
             pictures=arguments.out,
         ),
     )
     table = summary(rows)
-    (arguments.out / "summary.md").write_text(f"Preset `{arguments.preset}`.\n\n{table}")
+    (arguments.out / "summary.md").write_text(
+        f"Method `{arguments.method}`, preset `{arguments.preset}`.\n\n{table}"
+    )
     print(table)
 
 

@@ -21,7 +21,7 @@ result = pipeline.timeline(
     preset=arguments.preset,
     seed=2,
 )
-print(f"the legs are held to {100 * result.control_error[0]:.2f} cm")
+print(f"entries are held to {100 * result.control_error[0]:.2f} cm")
 print("to look at:", result.best.save("out/timeline.png"))
 
 clips = [("a person walks forward", 4), ("a person jumps", 3), ("a person bows", 4)]

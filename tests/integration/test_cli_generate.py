@@ -17,6 +17,7 @@ from controlmm.controls import (
     Avoid,
     ControlFile,
     HalfSpace,
+    JointControl,
     PathControl,
     Sphere,
     TimelineEntry,
@@ -281,8 +282,34 @@ def test_a_motion_is_edited(command: Command, tiny_pipeline_folder: Path, tmp_pa
         assert edited.text == "a person jumps"
         assert float(printed.splitlines()[2].split()[1]) > 0
     assert "jumps" in command(
-        "generate", "he jumps", "--edit", first[0], "--loose", "--out", tmp_path / "f", *model
+        "generate",
+        "he jumps",
+        "--edit",
+        first[0],
+        "--keep",
+        "0-1",
+        "--loose",
+        "--out",
+        tmp_path / "f",
+        *model,
     )
+
+
+def test_a_motion_is_edited_under_the_controls_and_obstacles_of_files(
+    command: Command, tiny_pipeline_folder: Path, walking_joints: torch.Tensor, tmp_path: Path
+) -> None:
+    source = Motion(walking_joints).save(tmp_path / "a.npz")
+    ball = ControlFile(obstacles=[Sphere((9.0, 1.0, 0.0), 0.2)])
+    controls = ControlFile([JointControl("head", [FRAMES - 1], [[0.0, 1.0, None]])], text="he walks on")
+    command(
+        "generate", "--edit", source, "--keep", "0-0.4", "--preset", "fast", "--formats", "npz",
+        "--controls", save_controls(controls, tmp_path / "c.json"),
+        "--obstacles", save_controls(ball, tmp_path / "o.json"),
+        "--out", tmp_path, "--model", tiny_pipeline_folder,
+    )  # fmt: skip
+    edited = Motion.load(tmp_path / "he-walks-on_0_0.npz")
+    assert edited.extra["mask"].nonzero().tolist() == [[FRAMES - 1, 15, 0], [FRAMES - 1, 15, 1]]
+    assert len(edited.extra["obstacles"]) == 1
 
 
 @pytest.mark.parametrize(
@@ -294,7 +321,10 @@ def test_a_motion_is_edited(command: Command, tiny_pipeline_folder: Path, tmp_pa
             ("--edit", "a.npz", "--seconds", "2"),
             "`--edit` and `--seconds` do not go together. Leave one out.",
         ),
-        (("--edit", "a.npz", "--controls", "line.json"), "`--edit` and `--controls` do not go together."),
+        (
+            ("--edit", "a.npz", "--controls", "long.json"),
+            "The controls are for a clip of 9 s, but the motion lasts",
+        ),
         (
             ("--edit", "a.npz", "--keep", "1"),
             "`--keep` must be START-END in seconds, such as 0-2.5, got '1'.",
@@ -312,5 +342,7 @@ def test_options_that_do_not_go_together_are_refused(
     Motion(walking_joints).save(folder / "a.npz")
     entry = TimelineEntry("body", "a person walks", frames=(0, FRAMES))
     save_controls(ControlFile(timeline=[entry]), folder / "t.json")
+    start = JointControl("head", [0], [[0, 1.6, 0]])
+    save_controls(ControlFile([start], seconds=9), folder / "long.json")
     files = {path.name: str(path) for path in folder.iterdir()}
     assert said in refused("generate", PROMPT, *(files.get(argument, argument) for argument in arguments))

@@ -7,16 +7,18 @@ import dataclasses
 import pytest
 import torch
 
-from controlmm.controls import Avoid, JointControl, Sphere, TimelineEntry
+from controlmm.controls import Avoid, JointControl, Sphere, TimelineEntry, penetration
+from controlmm.generation.composition import TRANSITION
 from controlmm.generation.editing import EditingBudget
 from controlmm.generation.terms import ObstacleTerm
 from controlmm.motion.motion import Motion
-from controlmm.pipelines import Preset
+from controlmm.motion.skeleton import HUMANML3D
+from controlmm.pipelines import TLCONTROL_PRESETS, Preset
 from controlmm.pipelines.pipeline import MotionPipeline
-from controlmm.pipelines.timeline import TRANSITION
 
 QUICK = Preset(EditingBudget(latent_iterations=3), steps=2)
 EDITED = Preset(EditingBudget(latent_iterations=150), steps=2)
+SOLVED = Preset(EditingBudget(solver="auto", latent_iterations=20), steps=2)
 ENTRIES = [
     TimelineEntry("left_foot", "a person kicks", frames=(0, 16)),
     TimelineEntry("lower", "a person jumps", frames=(16, 40)),
@@ -48,7 +50,7 @@ def held(call):
 
 def test_each_pass_holds_exactly_what_earlier_entries_decided(tiny_pipeline, passes):
     """The published way. Source: MaskControl's demo; lower = 0, 10, 11."""
-    result = tiny_pipeline.timeline(ENTRIES, preset=QUICK, hold_rest=False)
+    result = tiny_pipeline.timeline(ENTRIES, preset=QUICK, method="published")
     first, second, third = map(held, passes)
     assert first == {}
     assert second == {10: set(range(16))}
@@ -63,7 +65,7 @@ def test_the_rest_of_the_body_is_held_outside_an_entry_but_for_a_transition(tiny
         TimelineEntry("lower", "a person walks", frames=(0, 40)),
         TimelineEntry("right_wrist", "a person waves", frames=(16, 28)),
     ]
-    tiny_pipeline.timeline(entries, preset=QUICK)
+    tiny_pipeline.timeline(entries, preset=QUICK, method="passes")
     outside = {*range(16 - TRANSITION), *range(28 + TRANSITION, 40)}
     assert held(passes[1]) == {joint: set(range(40)) for joint in (0, 10, 11)}  # what the networks see
     (rest,) = passes[1]["terms"]
@@ -73,14 +75,14 @@ def test_the_rest_of_the_body_is_held_outside_an_entry_but_for_a_transition(tiny
 
 
 def test_frames_that_no_pass_has_made_yet_are_free(tiny_pipeline, passes):
-    tiny_pipeline.timeline(ENTRIES[:2], preset=QUICK)
+    tiny_pipeline.timeline(ENTRIES[:2], preset=QUICK, method="passes")
     assert held(passes[1]) == {10: set(range(16))}
     (rest,) = passes[1]["terms"]
     assert rest.mask.any(2).any(2)[0].nonzero().max() == 16 - TRANSITION - 1
 
 
 def test_pins_are_taken_from_the_newest_pass_and_held_by_editing(tiny_pipeline, passes):
-    result = tiny_pipeline.timeline(ENTRIES, preset=EDITED, samples=2)
+    result = tiny_pipeline.timeline(ENTRIES, preset=EDITED, samples=2, method="passes")
     targets, mask = passes[2]["targets"], passes[2]["mask"]
     for motion, wanted, asked, error in zip(result, targets, mask, result.control_error, strict=True):
         distance = (motion.joints - wanted)[asked.all(-1)].norm(dim=-1).mean()
@@ -88,23 +90,63 @@ def test_pins_are_taken_from_the_newest_pass_and_held_by_editing(tiny_pipeline, 
         assert distance < 0.4  # 2 m without the editing of this tiny model
 
 
-def test_samples_of_a_timeline_do_not_depend_on_their_number(tiny_pipeline):
-    two, one = (tiny_pipeline.timeline(ENTRIES, preset=QUICK, samples=count, seed=4) for count in (2, 1))
+@pytest.mark.parametrize("method", ["passes", "tracks"])
+def test_samples_of_a_timeline_do_not_depend_on_their_number(tiny_pipeline, method):
+    options = {"preset": QUICK, "method": method}
+    two, one = (tiny_pipeline.timeline(ENTRIES, samples=count, seed=4, **options) for count in (2, 1))
     torch.testing.assert_close(two[0].joints, one[0].joints, rtol=0, atol=1e-3)
     assert (two[0].joints - two[1].joints).abs().max() > 1e-3
-    other = tiny_pipeline.timeline(ENTRIES, preset=QUICK, seed=5)
+    other = tiny_pipeline.timeline(ENTRIES, seed=5, **options)
     assert (other[0].joints - one[0].joints).abs().max() > 1e-3
 
 
 def test_controls_and_obstacles_count_in_every_pass(tiny_pipeline, passes):
     start = JointControl("pelvis", frames=[0], positions=[[3, 0.9, 1]])
     moving = Avoid(Sphere([[3, 1, 2], [4, 1, 2]], 0.2), frames=[0, 39])
-    result = tiny_pipeline.timeline(ENTRIES, controls=[start], obstacles=[moving], preset=QUICK)
+    result = tiny_pipeline.timeline(
+        ENTRIES, controls=[start], obstacles=[moving], preset=QUICK, method="passes"
+    )
     assert all(call["mask"][0, 0, 0].all() for call in passes)
     assert [sum(isinstance(term, ObstacleTerm) for term in call["terms"]) for call in passes] == [1, 1, 1]
     torch.testing.assert_close(passes[0]["targets"][0, 0, 0], torch.tensor([0.0, 0.9, 0.0]))
     assert (result.best.joints[0, 0, [0, 2]] - torch.tensor([3.0, 1.0])).norm() < 0.2
     assert result.best.extra["obstacles"] == (moving,)
+
+
+def test_tracks_are_made_apart_and_see_the_controls_of_their_joints(tiny_pipeline, passes):
+    entries = [
+        TimelineEntry("lower", "a person walks", frames=(0, 60)),
+        TimelineEntry("right_arm", "a person waves", frames=(20, 36)),
+    ]
+    goal = JointControl("pelvis", frames=[0, 59], positions=[[1, None, 2], [1, None, 4]])
+    hand = JointControl("right_wrist", frames=[30], positions=[[1, 1.3, 3]])
+    result = tiny_pipeline.timeline(entries, controls=[goal, hand], preset=SOLVED, samples=2)
+    (call,) = passes
+    assert call["lengths"] == [60, 60, 26, 26]  # the wave with a transition on either side
+    assert torch.equal(call["text"][0], call["text"][1])
+    assert not torch.equal(call["text"][1], call["text"][2])
+    assert [sorted(set(clip.nonzero()[:, 1].tolist())) for clip in call["mask"]] == [[0], [0], [], []]
+    torch.testing.assert_close(call["targets"][0, 59, 0], torch.tensor([0.0, 0.0, 2.0]))
+    blind = tiny_pipeline.timeline(entries, preset=SOLVED).best
+    for frame, joint, place in ((59, 0, [1.0, 0.0, 4.0]), (30, 21, [1.0, 1.3, 3.0])):
+        off = [(m.joints[frame, joint] - torch.tensor(place))[[0, 2]].norm() for m in (*result, blind)]
+        assert max(off[:2]) < 0.7 * off[2]  # an untrained model has steps to hold that lead elsewhere
+    assert result.best.num_frames == 60
+    assert result.best.extra["timeline"] == tuple(entries)
+
+
+def test_obstacles_are_avoided_by_what_tracks_make(tiny_pipeline):
+    free = tiny_pipeline.timeline(ENTRIES, preset=EDITED)
+    ball = Avoid(Sphere((free.best.joints[20, 15] + torch.tensor([0.1, 0.0, 0.0])).tolist(), 0.2))
+    result = tiny_pipeline.timeline(ENTRIES, obstacles=[ball], preset=EDITED)
+    assert result.penetration.item() < 0.5 * penetration(free.best.joints[None], [ball], HUMANML3D).item()
+
+
+def test_tracks_work_with_tlcontrol(tiny_tlcontrol):
+    plan = dataclasses.replace(TLCONTROL_PRESETS["fast"], iterations=2)
+    result = tiny_tlcontrol.timeline(ENTRIES, preset=plan)
+    assert result.best.num_frames == 40
+    assert torch.isfinite(result.best.joints).all()
 
 
 def test_a_timeline_may_be_longer_than_a_call(tiny_pipeline):
@@ -121,6 +163,12 @@ def test_what_a_timeline_cannot_do_is_refused_before_anything_runs(tiny_pipeline
     too_long = [TimelineEntry("body", "a person walks", frames=(0, tiny_pipeline.longest + 8))]
     with pytest.raises(ValueError, match=r"The timeline ends at frame 400 \(20 s\), .* at most 392 frames"):
         tiny_pipeline.timeline(too_long)
+    with pytest.raises(
+        ValueError, match=r"`method` must be one of .'tracks', 'passes', 'published'., got 'x'"
+    ):
+        tiny_pipeline.timeline(ENTRIES, method="x")
+    with pytest.raises(ValueError, match=r"`preset` 'exact' makes single motions"):
+        tiny_pipeline.timeline(ENTRIES, preset="exact")
     with pytest.raises(ValueError, match=r"`entries` is empty"):
         tiny_pipeline.timeline([])
     with pytest.raises(ValueError, match=r"names frame 50, but the clip has 40 frames"):

@@ -79,7 +79,13 @@ def generate(
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but the names of the files.")] = False,
 ) -> None:
     """Generate motions and print how well each of them meets its controls."""
-    from controlmm.cli.scene_options import all_obstacles, check_together, parse_interval, timeline_entries
+    from controlmm.cli.scene_options import (
+        all_obstacles,
+        check_same_length,
+        check_together,
+        parse_interval,
+        timeline_entries,
+    )
     from controlmm.controls import load_controls
     from controlmm.motion.motion import Motion
 
@@ -99,7 +105,9 @@ def generate(
     }  # fmt: skip
     held = document.controls if document else ()
     source = Motion.load(edit) if edit else None
-    seconds = None if entries else _chosen_seconds(seconds, document, controls)
+    if source is not None:
+        check_same_length(document, source)
+    seconds = None if entries or source else _chosen_seconds(seconds, document, controls)
     intervals = [parse_interval(text) for text in keep or ()]
 
     from controlmm.pipelines import ControlMM, TLControl, load_pipeline
@@ -116,8 +124,9 @@ def generate(
             result = pipeline.timeline(entries, controls=held, obstacles=avoided, **options)
         elif source is not None and isinstance(pipeline, ControlMM):
             result = pipeline.edit(
-                source, prompt, keep=intervals, keep_parts=keep_part or (), exact=not loose, **options
-            )
+                source, prompt, keep=intervals, keep_parts=keep_part or (), controls=held, obstacles=avoided,
+                exact=not loose, **options,
+            )  # fmt: skip
         else:
             result = pipeline(prompt, seconds=seconds, controls=held, obstacles=avoided, **options)
     stem = f"{slug(prompt)}_{seed}"

@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from controlmm.controls import Avoid, ControlFile, TimelineEntry
+    from controlmm.motion.motion import Motion
+
+_FPS = 20  # of controls and of motions that are edited
 
 
 def all_obstacles(document: ControlFile | None, path: Path | None) -> tuple[Avoid, ...]:
@@ -59,6 +62,20 @@ def parse_interval(text: str) -> tuple[float, float]:
         raise ValueError(f"`--keep` must be START-END in seconds, such as 0-2.5, got {text!r}.") from None
 
 
+def check_same_length(document: ControlFile | None, motion: Motion) -> None:
+    """Refuse controls of a clip of another length than the motion that is edited.
+
+    Raises:
+        ValueError: With both lengths.
+    """
+    if document is None or document.seconds is None or round(document.seconds * _FPS) == motion.num_frames:
+        return
+    raise ValueError(
+        f"The controls are for a clip of {document.seconds:g} s, but the motion lasts "
+        f"{motion.num_frames / _FPS:g} s, and editing keeps its length. Change `seconds` in the file."
+    )
+
+
 def check_together(*, edit: Path | None, has_timeline: bool, **others: object) -> None:
     """Refuse options that do not go together: nothing that was asked for is ignored.
 
@@ -76,7 +93,7 @@ def check_together(*, edit: Path | None, has_timeline: bool, **others: object) -
             "`--timeline` and `--edit` do not go together. Edit what a timeline made in a second call."
         )
     for first, is_there, allowed in (
-        ("--edit", edit is not None, {"keep", "keep-part", "loose"}),
+        ("--edit", edit is not None, {"keep", "keep-part", "loose", "controls", "obstacles"}),
         ("--timeline", has_timeline, {"controls", "obstacles"}),
         ("--controls", edit is None and not has_timeline, {"controls", "obstacles", "seconds", "vary"}),
     ):

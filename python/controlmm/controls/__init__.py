@@ -1,7 +1,7 @@
 """Spatial controls: joints, ground paths, poses, obstacles, objectives, timelines; files; dense form."""
 
 from controlmm.controls.avoid import Avoid, as_avoids
-from controlmm.controls.clearance import check_targets_clear, penetration
+from controlmm.controls.clearance import check_kept_clear, check_targets_clear, penetration
 from controlmm.controls.dense import DenseControls, densify, stack_dense
 from controlmm.controls.file import ControlFile, load_controls, save_controls
 from controlmm.controls.joint import JointControl
@@ -34,6 +34,7 @@ __all__ = [
     "Sphere",
     "TimelineEntry",
     "as_avoids",
+    "check_kept_clear",
     "check_targets_clear",
     "check_timeline",
     "densify",

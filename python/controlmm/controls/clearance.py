@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controlmm.controls.avoid import Avoid
@@ -48,14 +48,9 @@ def check_targets_clear(controls: DenseControls, obstacles: Sequence[Avoid], ske
     Raises:
         ValueError: Naming the first such target, and by how much it is inside.
     """
-    is_point = controls.mask.all(-1)  # (T, J)
+    is_point = controls.mask.all(-1)
     for index, obstacle in enumerate(obstacles):
-        rooms = clearance(controls.targets[None] / _METRE[skeleton.unit], obstacle, skeleton)[0]
-        joints = obstacle.joint_indices(skeleton) or tuple(range(skeleton.num_joints))
-        rooms = rooms[:, : len(joints)].masked_fill(~is_point[:, joints], torch.inf)
-        frame, column = divmod(int(rooms.argmin()), len(joints))
-        room = float(rooms[frame, column])
-        name = skeleton.joint_names[joints[column]]
+        room, frame, name = _nearest(controls.targets, is_point, obstacle, skeleton)
         who = f"obstacle {index} ({obstacle.label})"
         if room < 0:
             raise ValueError(
@@ -68,6 +63,47 @@ def check_targets_clear(controls: DenseControls, obstacles: Sequence[Avoid], ske
                 f"of {obstacle.margin:g} m: the motion will miss one of them by a little.",
                 stacklevel=4,
             )
+
+
+def check_kept_clear(
+    joints: Float[Tensor, "T J 3"],
+    kept: Bool[Tensor, "T J"],
+    obstacles: Sequence[Avoid],
+    skeleton: Skeleton,
+    *,
+    slack: float,
+) -> None:
+    """Refuse joints of a motion that are to stay where they are, inside an obstacle.
+
+    Args:
+        joints: In the skeleton's unit, in the world of the obstacles.
+        kept: Which of them stay.
+        obstacles: In metres.
+        skeleton: Joints and unit.
+        slack: Metres that they may be inside.
+
+    Raises:
+        ValueError: Naming the deepest.
+    """
+    for index, obstacle in enumerate(obstacles):
+        room, frame, name = _nearest(joints, kept, obstacle, skeleton)
+        if room < -slack:
+            raise ValueError(
+                f"What is kept has {name} at frame {frame} {-room:.3f} m inside obstacle {index} "
+                f"({obstacle.label}), which that joint must avoid. Keep less, move the obstacle, or leave "
+                "the joint out of its `joints`."
+            )
+
+
+def _nearest(
+    points: Float[Tensor, "T J 3"], counts: Bool[Tensor, "T J"], obstacle: Avoid, skeleton: Skeleton
+) -> tuple[float, int, str]:
+    """Room in metres of the point nearest to an obstacle or deepest in it, its frame and its joint."""
+    joints = obstacle.joint_indices(skeleton) or tuple(range(skeleton.num_joints))
+    rooms = clearance(points[None] / _METRE[skeleton.unit], obstacle, skeleton)[0]
+    rooms = rooms[:, : len(joints)].masked_fill(~counts[:, joints], torch.inf)
+    frame, column = divmod(int(rooms.argmin()), len(joints))
+    return float(rooms[frame, column]), frame, skeleton.joint_names[joints[column]]
 
 
 def clearance(

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from controlmm.generation.decoding_rules import DecodingRules, likeliest_share
 from controlmm.generation.editing import EditingBudget, edit_logits
+from controlmm.generation.kept_tokens import KeptTokens
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.noise import ClipNoise
 from controlmm.generation.objective import ControlObjective
@@ -39,12 +40,18 @@ class DecodingRequest:
     rules: DecodingRules = field(default_factory=DecodingRules)
     progress: Progress | None = None
     watch: Callable[[int, Float[Tensor, "B L"]], None] | None = None  # (step, confidence of every token)
+    kept: KeptTokens | None = None  # of a motion that is there; the others are drawn
 
     @property
     def lengths(self) -> list[int]:
         """Tokens of each clip."""
         counts: list[int] = self.valid.sum(1).tolist()
         return counts
+
+    @property
+    def drawn(self) -> Bool[Tensor, "B L"]:
+        """Which tokens are drawn."""
+        return self.valid if self.kept is None else self.valid & ~self.kept.where
 
     def gumbel(self, width: int) -> Float[Tensor, "B L K"]:
         """Fresh noise for every token of every clip."""
@@ -59,10 +66,15 @@ class DecodingRequest:
 
 
 def decode_from_text(base: MaskedTransformer, request: DecodingRequest) -> Int[Tensor, "B L"]:
-    """Base tokens of motions that follow a text only (MoMask's loop); -1 in padding."""
-    valid = request.valid
+    """Base tokens of motions that follow a text only (MoMask's loop); -1 in padding.
+
+    Tokens that are kept stay, and the network sees them: temporal in-painting (MoMask, section 3.5).
+    """
+    valid, kept = request.valid, request.kept
     ids = torch.where(valid, base.mask_id, base.pad_id)
-    scores = torch.zeros(valid.shape).masked_fill(~valid, DECIDED)
+    if kept is not None:
+        ids = torch.where(kept.where, kept.ids[..., 0], ids)
+    scores = torch.zeros(valid.shape).masked_fill(~request.drawn, DECIDED)
     for step in range(request.steps):
         hidden = lowest(scores, masked_counts(request, step))
         ids = torch.where(hidden, base.mask_id, ids)
@@ -89,15 +101,19 @@ def decode_with_control(
 
     Unlike without control, tokens stay soft: every step predicts all of them anew, and the motion comes from
     the last logits, not from the ids that were drawn on the way. Those only decide where MASK is put back.
-    Without a ``branch`` only logits editing follows the objective, which then need not hold targets.
+    Without a ``branch`` only logits editing follows the objective, which then need not hold targets. Tokens
+    that are kept have logits that leave no doubt.
     """
-    valid, codes, rules = request.valid, decoder.tokenizer.base_codes, request.rules
+    valid, codes, rules, kept = request.valid, decoder.tokenizer.base_codes, request.rules, request.kept
     keep = valid[..., None].float()
     frames = valid.repeat_interleave(decoder.downsample, dim=1)
     mask_embedding, mean_code = base.token_embedding.weight[base.mask_id], codes.mean(0)
     logits = torch.ones(*valid.shape, len(codes))
     embedded = mask_embedding.expand(*valid.shape, -1)
-    scores = torch.zeros(valid.shape).masked_fill(~valid, DECIDED)
+    if kept is not None:
+        logits = kept.certain(logits)
+        embedded = torch.where(kept.where[..., None], base.embed(kept.ids[..., 0].clamp(min=0)), embedded)
+    scores = torch.zeros(valid.shape).masked_fill(~request.drawn, DECIDED)
     for step in range(request.steps):
         hidden = lowest(scores, masked_counts(request, step))[..., None]
         embedded = torch.where(hidden, mask_embedding, embedded)
@@ -107,6 +123,8 @@ def decode_with_control(
             latents = torch.where(hidden, mean_code, logits.softmax(-1) @ codes) * keep
             signal = branch.signal(objective.targets, objective.mask, decoder(latents, frames))
             logits = guided(partial(_controlled_logits, base, branch, embedded, signal, valid), request)
+        if kept is not None:
+            logits = kept.certain(logits)
         if budget.logits_iterations:
             logits = edit_logits(
                 logits,
@@ -216,9 +234,9 @@ def guided(
 
 
 def masked_counts(request: DecodingRequest, step: int) -> Int[Tensor, "B"]:
-    """Tokens to hide in ``step``: ``max(1, round(cos(pi t / 2) length))``, t from 0 to 1 inclusive."""
+    """Tokens to hide in ``step``: ``max(1, round(cos(pi t / 2) drawn))``, t from 0 to 1 inclusive."""
     t = step / max(1, request.steps - 1)
-    counts = (math.cos(0.5 * math.pi * t) * request.valid.sum(1)).round().long()
+    counts = (math.cos(0.5 * math.pi * t) * request.drawn.sum(1)).round().long()
     return counts.clamp(min=1)
 
 

@@ -123,6 +123,29 @@ class HeldTerm:
 
 
 @dataclass(frozen=True, eq=False)
+class Placed:
+    """A term of the world, of motions that stand turned and moved there.
+
+    Attributes:
+        term: What is minimised.
+        turn: (3, 3) from the networks' frame to the world.
+        offset: (3,) of the turned frame in the world.
+    """
+
+    term: JointTerm
+    turn: Float[Tensor, "3 3"]
+    offset: Float[Tensor, "3"]
+
+    def values(self, joints: Float[Tensor, "B T J 3"]) -> Float[Tensor, "B"]:
+        """See :class:`JointTerm`."""
+        return self.term.values(joints @ self.turn.T + self.offset)
+
+    def select(self, clips: Int[Tensor, " N"]) -> Placed:
+        """See :class:`JointTerm`."""
+        return replace(self, term=self.term.select(clips))
+
+
+@dataclass(frozen=True, eq=False)
 class OnFloor:
     """A term of motions that will be stood on the floor: it sees them there already.
 

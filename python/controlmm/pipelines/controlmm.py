@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from controlmm.controls import Control
+from controlmm.controls import Avoid, Control, Objective, Obstacle
 from controlmm.generation.latent_editing import edit_latents
 from controlmm.generation.masked_decoding import (
     DecodingRequest,
@@ -140,6 +140,9 @@ class ControlMM(MotionPipeline[Preset]):
         *,
         keep: Sequence[tuple[float, float]] = (),
         keep_parts: Sequence[str] = (),
+        controls: Sequence[Control] = (),
+        obstacles: Sequence[Obstacle | Avoid] = (),
+        objectives: Sequence[Objective] = (),
         exact: bool = True,
         samples: int = 1,
         preset: str | Preset = "balanced",
@@ -156,11 +159,16 @@ class ControlMM(MotionPipeline[Preset]):
         - neither: every decoding step draws the least certain 16 % of the tokens anew; the motion drifts
           towards the prompt.
 
+        Controls, obstacles and objectives count as in a call, in the world of ``motion``.
+
         Args:
             motion: What to change, at most 196 frames at 20 fps, anywhere in the world.
             prompt: What the person does where nothing is kept.
             keep: (start, end) in seconds; may be several.
             keep_parts: Parts (see ``controlmm.controls.PARTS``) or joints.
+            controls: Targets in the world of ``motion``; on what is kept they must agree with it to 1 cm.
+            obstacles: Shapes that joints keep out of, there. Nothing that is kept may be inside.
+            objectives: As in a call.
             exact: Move what was kept back onto the source after drawing: a kept ending is where it was.
                 ``False`` leaves it as the tokens decode: poses are kept to some centimetres, but the way
                 on the ground goes on from wherever the new part leads.
@@ -171,11 +179,13 @@ class ControlMM(MotionPipeline[Preset]):
             progress: As in a call.
 
         Returns:
-            Motions in the world of ``motion``; ``control_error`` is the distance of what was kept.
+            Motions in the world of ``motion``; ``control_error`` is the mean distance of what was kept or
+            that of the controlled joints, whichever is larger.
 
         Raises:
             TypeError: If an argument has the wrong type; nothing has run then.
-            ValueError: If an argument is unusable, or everything is kept; nothing has run then.
+            ValueError: If an argument is unusable, everything is kept, or what is kept contradicts controls
+                or obstacles; nothing has run then.
         """
         return run_edit(
             self,
@@ -183,9 +193,12 @@ class ControlMM(MotionPipeline[Preset]):
             prompt,
             keep=keep,
             keep_parts=keep_parts,
+            controls=controls,
+            obstacles=obstacles,
+            objectives=objectives,
             exact=exact,
             samples=samples,
-            preset=resolve_preset(preset, guidance_scale=guidance_scale),
+            preset=self.inexact(preset, guidance_scale),
             seed=seed,
             progress=progress,
         )
@@ -289,29 +302,51 @@ class ControlMM(MotionPipeline[Preset]):
                 norm=preset.control_norm,
                 terms=[term.select(rows) for term in terms],
             )
-            latents[rows] = self._edited(request, objective, branch, preset)
+            drawn = self.drawn_latents(request, objective, branch, preset)
+            keep = request.valid[..., None].float()
+            latents[rows] = edit_latents(objective, drawn, keep, preset.budget, progress=progress).latents
         return latents
 
     def _from_text(self, request: DecodingRequest, preset: Preset) -> Tensor:
         base_ids = decode_from_text(self.transformer, request)
-        ids = fill_residual_layers(
-            self.residual, base_ids, request, guidance_scale=preset.residual_guidance_scale
-        )
-        return self.decoder.tokenizer.quantizer.lookup(ids)
+        return self.decoder.tokenizer.quantizer.lookup(self._filled(base_ids, request, preset))
 
-    def _edited(
+    def _filled(self, base_ids: Tensor, request: DecodingRequest, preset: Preset) -> Tensor:
+        """All layers of codes: those of tokens that are kept, the others from the residual transformer."""
+        scale = preset.residual_guidance_scale
+        ids = fill_residual_layers(self.residual, base_ids, request, guidance_scale=scale)
+        return ids if request.kept is None else request.kept.put_back(ids)
+
+    def refined_latents(
+        self,
+        latents: Float[Tensor, "B L C"],
+        valid: Bool[Tensor, "B L"],
+        targets: Float[Tensor, "B T J 3"],
+        mask: Bool[Tensor, "B T J 3"],
+        preset: Preset,
+        *,
+        terms: Sequence[JointTerm] = (),
+        progress: Progress | None = None,
+    ) -> Float[Tensor, "B L C"]:
+        """See :class:`MotionPipeline`."""
+        frames = valid.repeat_interleave(self.decoder.downsample, dim=1)
+        objective = ControlObjective(
+            self.decoder, targets, mask, frames, norm=preset.control_norm, terms=terms
+        )
+        keep = valid[..., None].float()
+        return edit_latents(objective, latents, keep, preset.budget, progress=progress).latents
+
+    def drawn_latents(
         self,
         request: DecodingRequest,
         objective: ControlObjective,
         branch: ControlBranch | None,
         preset: Preset,
-    ) -> Tensor:
+    ) -> Float[Tensor, "B L C"]:
+        """Latents before they are edited; a ``branch`` and logits editing take them towards targets."""
         if branch is None and not preset.budget.logits_iterations:
-            latents = self._from_text(request, preset)
-        else:
-            latents = self._from_logits(request, objective, branch, preset)
-        keep = request.valid[..., None].float()
-        return edit_latents(objective, latents, keep, preset.budget, progress=request.progress).latents
+            return self._from_text(request, preset)
+        return self._from_logits(request, objective, branch, preset)
 
     def _from_logits(
         self,
@@ -328,10 +363,7 @@ class ControlMM(MotionPipeline[Preset]):
             request,
             budget=preset.budget,
         )
-        base_ids = final_base_ids(logits, request)
-        ids = fill_residual_layers(
-            self.residual, base_ids, request, guidance_scale=preset.residual_guidance_scale
-        )
+        ids = self._filled(final_base_ids(logits, request), request, preset)
         return final_latents(self.decoder.tokenizer, logits, ids, request)
 
 

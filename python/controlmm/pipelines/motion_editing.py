@@ -1,32 +1,38 @@
-"""Editing a motion that exists: some of it stays, a prompt decides the rest."""
+"""Editing a motion that exists: some of it stays, a prompt and controls decide the rest."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from controlmm.generation.inpainting import RESIDUAL_GUIDANCE, inpaint_tokens, vary_tokens
+from controlmm.controls import Avoid, Control, Objective, Obstacle, penetration
+from controlmm.generation.kept_tokens import KeptTokens
 from controlmm.generation.latent_editing import edit_latents
 from controlmm.generation.masked_decoding import DecodingRequest, fill_residual_layers
 from controlmm.generation.noise import ClipNoise, clip_seeds
 from controlmm.generation.objective import ControlObjective, control_error
 from controlmm.generation.solvers import Progress
+from controlmm.generation.terms import JointTerm
+from controlmm.generation.variation import vary_tokens
 from controlmm.motion.motion import Motion
 from controlmm.ops import recover_joints
 from controlmm.pipelines.checks import check_sampling
+from controlmm.pipelines.edit_scene import EditScene, held_term
 from controlmm.pipelines.output import GenerationResult
 from controlmm.pipelines.pipeline import MAX_FRAMES
 from controlmm.pipelines.presets import Preset
-from controlmm.pipelines.source_motion import Interval, SourceMotion, kept_coordinates, kept_frames
-from controlmm.text import check_prompt
+from controlmm.pipelines.source_motion import Interval
 
 if TYPE_CHECKING:
     from controlmm.pipelines.controlmm import ControlMM
+
+_RESIDUAL_GUIDANCE = 2.0  # MoMask's, for edited motions
 
 
 def run_edit(
@@ -36,6 +42,9 @@ def run_edit(
     *,
     keep: Sequence[Interval],
     keep_parts: Sequence[str],
+    controls: Sequence[Control],
+    obstacles: Sequence[Obstacle | Avoid],
+    objectives: Sequence[Objective],
     exact: bool,
     samples: int,
     preset: Preset,
@@ -44,94 +53,152 @@ def run_edit(
 ) -> GenerationResult:
     """See :meth:`ControlMM.edit`."""
     started = time.perf_counter()
-    prompt = check_prompt(prompt)
     check_sampling(samples=samples, seed=seed)
-    skeleton = pipeline.skeleton
-    source = SourceMotion.of(motion, skeleton=skeleton, max_frames=MAX_FRAMES)
-    kept = kept_coordinates(source, keep, keep_parts, skeleton)
-    frames = source.num_frames
-    mask = kept[None, ..., None].expand(samples, -1, -1, 3)
-    targets = source.joints.expand(samples, -1, -1, -1) * mask
-    text = pipeline.text_encoder.encode([prompt]).pooled.expand(samples, -1)
-    seeds = clip_seeds(seed, samples)
-    if keep_parts:
-        latents = pipeline.generate_latents(
-            text,
-            lengths=[frames] * samples,
-            targets=targets,
-            mask=mask,
-            seeds=seeds,
-            preset=preset,
-            progress=progress,
-        )
-    else:
-        whole = kept_frames(frames, keep, skeleton.fps)
-        request = _request(pipeline, text, frames, seeds, preset, progress)
-        latents = _redrawn(pipeline, source, request, whole)
-        if exact and keep:
-            pinning = _pinning(pipeline, targets, mask)
-            all_tokens = torch.ones(*request.valid.shape, 1)
-            latents = edit_latents(pinning, latents, all_tokens, preset.budget, progress=progress).latents
-    features = pipeline.decoder.features(latents)[:, :frames]
-    joints = recover_joints(features, joints=skeleton.num_joints)
-    error = control_error(joints, targets, mask)
-    # Whole poses are not targets in pictures: thousands of points would hide the figure.
-    extra = {"targets": source.placed(source.joints), "mask": mask[0]} if keep_parts and not keep else {}
-    motions = tuple(
-        Motion(
-            source.placed(clip), features=own.contiguous(), skeleton=skeleton, text=prompt, extra=dict(extra)
-        )
-        for clip, own in zip(joints, features, strict=True)
+    scene = EditScene.of_call(
+        motion,
+        prompt,
+        keep=keep,
+        keep_parts=keep_parts,
+        controls=controls,
+        obstacles=obstacles,
+        objectives=objectives,
+        skeleton=pipeline.skeleton,
+        max_frames=MAX_FRAMES,
     )
-    return GenerationResult(motions, error, torch.zeros_like(error), latents, time.perf_counter() - started)
-
-
-def _request(
-    pipeline: ControlMM,
-    text: Float[Tensor, "B E"],
-    frames: int,
-    seeds: Sequence[int],
-    preset: Preset,
-    progress: Progress | None,
-) -> DecodingRequest:
-    tokens = pipeline.padded_frames(frames) // pipeline.decoder.downsample
-    return DecodingRequest(
+    if not exact and not keep:
+        raise ValueError("`exact=False` is about `keep`, and nothing is kept by it. Leave one out.")
+    frames = scene.source.num_frames
+    padded = pipeline.padded_frames(frames)
+    ids = _tokens(pipeline, scene, padded).expand(samples, -1, -1)
+    text = pipeline.text_encoder.encode([scene.prompt]).pooled.expand(samples, -1)
+    request = DecodingRequest(
         text,
-        torch.ones(len(text), tokens, dtype=torch.bool),
-        ClipNoise(seeds),
+        torch.ones(ids.shape[:2], dtype=torch.bool),
+        ClipNoise(clip_seeds(seed, samples)),
         steps=preset.steps,
         guidance_scale=preset.guidance_scale,
         rules=preset.rules,
         progress=progress,
+        kept=_kept_tokens(pipeline, scene, ids),
     )
+    terms = scene.terms(samples, padded)
+    latents = _drawn(pipeline, scene, request, ids, terms, preset)
+    objective = _final(pipeline, scene, terms, samples, preset, exact=exact)
+    if objective.mask.any() or objective.terms:
+        may_change = request.valid if exact else request.drawn
+        may_change = may_change[..., None].float()
+        latents = edit_latents(objective, latents, may_change, preset.budget, progress=progress).latents
+    features = pipeline.decoder.features(latents)[:, :frames]
+    return _result(scene, features, latents, started)
 
 
-def _redrawn(
-    pipeline: ControlMM, source: SourceMotion, request: DecodingRequest, kept: Bool[Tensor, "T"]
-) -> Float[Tensor, "B L C"]:
-    """Latents with the source's tokens where all their frames are kept; the others follow the text."""
-    tokenizer, step = pipeline.decoder.tokenizer, pipeline.decoder.downsample
-    padded = request.valid.shape[1] * step
-    is_kept = nn.functional.pad(kept, (0, padded - len(kept)), value=True).unflatten(0, (-1, step)).all(1)
-    ids = _tokens(pipeline, source, padded).expand(len(request.text), -1, -1)
-    editable = ~is_kept.expand(len(ids), -1)
-    if editable.all():
-        base_ids = vary_tokens(pipeline.transformer, request, ids[..., 0])
-    else:
-        base_ids = inpaint_tokens(pipeline.transformer, request, ids[..., 0], editable)
-    filled = fill_residual_layers(pipeline.residual, base_ids, request, guidance_scale=RESIDUAL_GUIDANCE)
-    is_same = (base_ids == ids[..., 0])[..., None]
-    return tokenizer.quantizer.lookup(torch.where(is_same, ids, filled))
-
-
-def _tokens(pipeline: ControlMM, source: SourceMotion, padded: int) -> Int[Tensor, "1 L Q"]:
-    features = source.features.float()
+def _tokens(pipeline: ControlMM, scene: EditScene, padded: int) -> Int[Tensor, "1 L Q"]:
+    """Codes of the source; its last frame is repeated to fill the last token."""
+    features = scene.source.features.float()
     longer = torch.cat([features, features[-1:].expand(padded - len(features), -1)])
     ids: Tensor = pipeline.decoder.tokenizer.encode(pipeline.decoder.normalizer.normalize(longer)[None])
     return ids
 
 
-def _pinning(pipeline: ControlMM, targets: Tensor, mask: Tensor) -> ControlObjective:
-    missing = pipeline.padded_frames(targets.shape[1]) - targets.shape[1]
-    targets, mask = (nn.functional.pad(dense, (0, 0, 0, 0, 0, missing)) for dense in (targets, mask))
-    return ControlObjective(pipeline.decoder, targets, mask, torch.ones(mask.shape[:2], dtype=torch.bool))
+def _kept_tokens(pipeline: ControlMM, scene: EditScene, ids: Int[Tensor, "B L Q"]) -> KeptTokens | None:
+    """Tokens all of whose frames are kept as whole poses."""
+    if not scene.whole.any():
+        return None
+    missing = ids.shape[1] * pipeline.decoder.downsample - len(scene.whole)
+    whole = nn.functional.pad(scene.whole, (0, missing), value=True)
+    return KeptTokens(ids, whole.unflatten(0, (ids.shape[1], -1)).all(1).expand(ids.shape[:2]))
+
+
+def _drawn(
+    pipeline: ControlMM,
+    scene: EditScene,
+    request: DecodingRequest,
+    ids: Int[Tensor, "B L Q"],
+    terms: tuple[JointTerm, ...],
+    preset: Preset,
+) -> Float[Tensor, "B L C"]:
+    """Latents that follow the text, parts and controls, among the tokens that are kept."""
+    if not scene.kept.any():
+        base_ids = vary_tokens(pipeline.transformer, request, ids[..., 0])
+        varied = fill_residual_layers(pipeline.residual, base_ids, request, guidance_scale=_RESIDUAL_GUIDANCE)
+        is_same = (base_ids == ids[..., 0])[..., None]
+        return pipeline.decoder.tokenizer.quantizer.lookup(torch.where(is_same, ids, varied))
+    if request.kept is not None:
+        preset = replace(preset, residual_guidance_scale=_RESIDUAL_GUIDANCE)
+    shown = scene.shown
+    objective = _objective(pipeline, shown.targets, shown.mask, terms, len(ids), preset)
+    branch = None if shown.is_empty else pipeline.control
+    return pipeline.drawn_latents(request, objective, branch, preset)
+
+
+def _final(
+    pipeline: ControlMM,
+    scene: EditScene,
+    terms: tuple[JointTerm, ...],
+    samples: int,
+    preset: Preset,
+    *,
+    exact: bool,
+) -> ControlObjective:
+    """What latents are edited towards at the end: controls, parts, and whole poses if they are to be exact.
+
+    Kept poses are thousands of coordinates, a control may be one: their errors are averaged apart.
+    """
+    shown = scene.shown
+    held = scene.held & exact
+    if shown.is_empty:
+        return _objective(pipeline, scene.source.joints, held, terms, samples, preset)
+    if held.any():
+        padded = pipeline.padded_frames(len(held))
+        terms = (*terms, held_term(scene.source.joints, held, samples=samples, padded=padded))
+    return _objective(pipeline, shown.targets, shown.mask, terms, samples, preset)
+
+
+def _objective(
+    pipeline: ControlMM,
+    targets: Float[Tensor, "T J 3"],
+    mask: Bool[Tensor, "T J 3"],
+    terms: tuple[JointTerm, ...],
+    samples: int,
+    preset: Preset,
+) -> ControlObjective:
+    missing = (0, 0, 0, 0, 0, pipeline.padded_frames(len(mask)) - len(mask))
+    targets, mask = (nn.functional.pad(x, missing).expand(samples, -1, -1, -1) for x in (targets, mask))
+    frames = torch.ones(mask.shape[:2], dtype=torch.bool)
+    return ControlObjective(pipeline.decoder, targets, mask, frames, norm=preset.control_norm, terms=terms)
+
+
+def _result(
+    scene: EditScene, features: Float[Tensor, "B T D"], latents: Float[Tensor, "B L C"], started: float
+) -> GenerationResult:
+    """Motions in the world of the source, measured there."""
+    source, controls = scene.source, scene.controls
+    joints = source.placed(recover_joints(features, joints=scene.skeleton.num_joints))
+    world = source.placed(source.joints)
+    errors = [
+        control_error(joints, targets.expand_as(joints), mask.expand_as(joints))
+        for targets, mask in (
+            (world, scene.kept[..., None].expand_as(world)),
+            (controls.targets, controls.mask),
+        )
+    ]
+    extra = _extra(scene, world)
+    motions = tuple(
+        Motion(clip, features=own.contiguous(), skeleton=scene.skeleton, text=scene.prompt, extra=dict(extra))
+        for clip, own in zip(joints, features, strict=True)
+    )
+    depth = penetration(joints, scene.obstacles, scene.skeleton)
+    return GenerationResult(motions, torch.maximum(*errors), depth, latents, time.perf_counter() - started)
+
+
+def _extra(scene: EditScene, world: Float[Tensor, "T J 3"]) -> dict[str, Any]:
+    """Targets for pictures and files. Whole poses are none: thousands of points would hide the figure."""
+    parts = (scene.kept & ~scene.whole[:, None])[..., None].expand_as(world)
+    mask = parts | scene.controls.mask
+    extra: dict[str, Any] = {}
+    if mask.any():
+        targets = torch.where(scene.controls.mask, scene.controls.targets, world * parts)
+        extra |= {"targets": targets, "mask": mask}
+    if scene.obstacles:
+        extra["obstacles"] = scene.obstacles
+    return extra

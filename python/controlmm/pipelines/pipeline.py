@@ -29,7 +29,7 @@ from controlmm.pipelines.length import draw_frames
 from controlmm.pipelines.output import GenerationResult
 from controlmm.pipelines.reach import check_reach
 from controlmm.pipelines.scene import Scene
-from controlmm.pipelines.timeline import run_timeline
+from controlmm.pipelines.timeline import TimelineMethod, run_timeline
 from controlmm.text import TextEncoder, check_prompt
 
 MAX_FRAMES = 196
@@ -66,6 +66,20 @@ class MotionPipeline(ABC, Generic[_Plan]):
         Raises:
             ValueError: If a target lies after the end of its clip.
         """
+
+    @abstractmethod
+    def refined_latents(
+        self,
+        latents: Float[Tensor, "B L C"],
+        valid: Bool[Tensor, "B L"],
+        targets: Float[Tensor, "B T J 3"],
+        mask: Bool[Tensor, "B T J 3"],
+        preset: _Plan,
+        *,
+        terms: Sequence[JointTerm] = (),
+        progress: Progress | None = None,
+    ) -> Float[Tensor, "B L C"]:
+        """Latents moved towards targets (the networks' frame, padded to whole tokens) and ``terms``."""
 
     @abstractmethod
     def resolve_preset(self, preset: str | _Plan, guidance_scale: float | None) -> _Plan:
@@ -172,6 +186,21 @@ class MotionPipeline(ABC, Generic[_Plan]):
         """Whether joints are moved onto their targets after editing."""
         return False
 
+    def inexact(self, preset: str | _Plan, guidance_scale: float | None) -> _Plan:
+        """The preset for a call whose joints cannot be put on their targets afterwards.
+
+        Raises:
+            TypeError: If it is none.
+            ValueError: If there is none of that name, or it is to be exact.
+        """
+        plan = self.resolve_preset(preset, guidance_scale)
+        if self.wants_exact(plan):
+            raise ValueError(
+                "`preset` 'exact' makes single motions from controls; `timeline`, `chain` and `edit` cannot. "
+                "Use 'accurate'."
+            )
+        return plan
+
     def limited(self, plan: _Plan, tolerance: str | float | None, time_budget: str | float | None) -> _Plan:
         """``plan`` with other limits of editing.
 
@@ -200,29 +229,34 @@ class MotionPipeline(ABC, Generic[_Plan]):
         preset: str | _Plan = "balanced",
         guidance_scale: float | None = None,
         seed: int = 0,
-        hold_rest: bool = True,
+        method: TimelineMethod = "tracks",
         progress: Progress | None = None,
     ) -> GenerationResult:
         """Generate motions in which body parts follow prompts of their own, each in its own time.
 
-        One pass an entry, in their order: each pass follows its entry's prompt and holds the parts of
-        earlier entries, in their intervals, where the pass before had them. So an entry decides its part in
-        its interval, and later entries what is left of the body then.
+        An entry decides its part in its interval; where two entries name a part, the earlier one does. What
+        nobody names follows the entry that moves the legs, else the first that is there.
+
+        ``tracks`` makes a motion of every entry apart, as long as its interval, puts their parts onto one
+        body, and moves that towards controls and away from obstacles. ``passes`` makes the motion again for
+        every entry: each pass holds what earlier entries decided, and the whole body outside the entry's
+        interval but for 5 frames of transition. ``published`` is the same without the latter: each prompt
+        acts on the whole clip.
 
         Args:
             entries: Parts, prompts and intervals; may overlap. The motion ends with the last of them.
-            controls: As in a call, held in every pass.
-            obstacles: As in a call, avoided in every pass.
+            controls: As in a call.
+            obstacles: As in a call.
             samples: As in a call.
             preset: As in a call, for every pass.
             guidance_scale: As in a call.
             seed: As in a call.
-            hold_rest: Keep the whole body outside an entry's interval as the pass before had it, but for 5
-                frames of transition. ``False`` is the published way: each prompt acts on the whole clip.
+            method: ``tracks``, ``passes`` or ``published``.
             progress: As in a call; every pass reports anew.
 
         Returns:
-            The motions; ``control_error`` is how well the last pass held earlier entries and controls.
+            The motions; ``control_error`` is how well the tracks, or the last pass, held what entries and
+            controls had decided.
 
         Raises:
             TypeError: If an argument has the wrong type; nothing has run then.
@@ -234,9 +268,9 @@ class MotionPipeline(ABC, Generic[_Plan]):
             controls=controls,
             obstacles=obstacles,
             samples=samples,
-            preset=self.resolve_preset(preset, guidance_scale),
+            preset=self.inexact(preset, guidance_scale),
             seed=seed,
-            hold_rest=hold_rest,
+            method=method,
             progress=progress,
         )
 
@@ -279,7 +313,7 @@ class MotionPipeline(ABC, Generic[_Plan]):
             overlap=overlap,
             max_frames=MAX_FRAMES,
             samples=samples,
-            preset=self.resolve_preset(preset, guidance_scale),
+            preset=self.inexact(preset, guidance_scale),
             seed=seed,
             progress=progress,
         )

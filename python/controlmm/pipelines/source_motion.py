@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from controlmm.ops import recover_joints
 from controlmm.pipelines.checks import MIN_FRAMES
 
 Interval = tuple[float, float]  # seconds
+_ALIGNED = 0.005  # degrees: less than a millimetre over ten metres
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,17 +61,31 @@ class SourceMotion:
         features = motion.features if motion.features is not None else _features_of(motion.joints)
         joints = recover_joints(features[None], joints=skeleton.num_joints)[0]
         yaw = _yaw_between(joints[0], motion.joints[0])
-        offset = motion.joints[0].mean(0) - (joints[0] @ yaw_matrix(yaw).T).mean(0)
-        return cls(features, joints, yaw, offset)
+        turned = cls(features, joints, yaw, torch.zeros(3))
+        return dataclasses.replace(turned, offset=(motion.joints[0] - turned.placed(joints[0])).mean(0))
 
     @property
     def num_frames(self) -> int:
         """Number of frames."""
         return len(self.joints)
 
+    @property
+    def turn(self) -> Float[Tensor, "3 3"]:
+        """From the networks' frame to the world."""
+        return torch.eye(3) if self.is_aligned else yaw_matrix(self.yaw)
+
+    @property
+    def is_aligned(self) -> bool:
+        """Whether both frames have the same axes, as in motions that a pipeline made."""
+        return abs(self.yaw) < _ALIGNED
+
     def placed(self, joints: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3"]:
         """Points of the networks' frame in the world of the motion."""
-        return joints @ yaw_matrix(self.yaw).T + self.offset
+        return joints @ self.turn.T + self.offset
+
+    def unplaced(self, points: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3"]:
+        """Points of the world in the networks' frame."""
+        return (points - self.offset) @ self.turn
 
 
 def kept_coordinates(

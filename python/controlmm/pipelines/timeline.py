@@ -1,4 +1,4 @@
-"""Body-part timelines: one pass an entry, each pass holds what earlier entries decided.
+"""Body-part timelines: in tracks, or one pass an entry that holds what earlier entries decided.
 
 Source: ControlMM, section 4 and its published code, which leaves the feature unfinished.
 """
@@ -9,13 +9,14 @@ import dataclasses
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeVar, get_args
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from controlmm.controls import Avoid, Control, Obstacle, TimelineEntry, check_timeline, part_joints
+from controlmm.generation.composition import TRANSITION
 from controlmm.generation.noise import clip_seeds
 from controlmm.generation.objective import control_error
 from controlmm.generation.solvers import Progress
@@ -26,13 +27,14 @@ from controlmm.ops import recover_joints
 from controlmm.pipelines.checks import check_sampling
 from controlmm.pipelines.output import GenerationResult
 from controlmm.pipelines.scene import Scene
+from controlmm.pipelines.tracks import run_tracks
 
 if TYPE_CHECKING:
     from controlmm.pipelines.pipeline import MotionPipeline
 
 Plan = TypeVar("Plan")  # a pipeline's kind of preset
+TimelineMethod = Literal["tracks", "passes", "published"]
 
-TRANSITION = 5  # frames around an entry that no other holds, so that the motion can change over
 _PASS_SEED = 0x632BE59BD9B4E019  # odd 64-bit constant: each pass draws its own noise
 
 
@@ -45,12 +47,13 @@ def run_timeline(
     samples: int,
     preset: Plan,
     seed: int,
-    hold_rest: bool,
+    method: TimelineMethod,
     progress: Progress | None,
 ) -> GenerationResult:
     """See :meth:`MotionPipeline.timeline`."""
-    started = time.perf_counter()
     entries = check_timeline(entries)
+    if method not in get_args(TimelineMethod):
+        raise ValueError(f"`method` must be one of {get_args(TimelineMethod)}, got {method!r}.")
     check_sampling(samples=samples, seed=seed)
     frames = max(entry.end for entry in entries)
     if frames > pipeline.longest:
@@ -67,6 +70,40 @@ def run_timeline(
         skeleton=pipeline.skeleton,
         max_frames=pipeline.longest,
     )
+    if method == "tracks":
+        result = run_tracks(
+            pipeline, scene, entries, samples=samples, preset=preset, seed=seed, progress=progress
+        )
+    else:
+        hold_rest = method == "passes"
+        result = _run_passes(
+            pipeline,
+            scene,
+            entries,
+            samples=samples,
+            preset=preset,
+            seed=seed,
+            hold_rest=hold_rest,
+            progress=progress,
+        )
+    for motion in result:
+        motion.extra["timeline"] = entries
+    return result
+
+
+def _run_passes(
+    pipeline: MotionPipeline[Plan],
+    scene: Scene,
+    entries: Sequence[TimelineEntry],
+    *,
+    samples: int,
+    preset: Plan,
+    seed: int,
+    hold_rest: bool,
+    progress: Progress | None,
+) -> GenerationResult:
+    """One pass an entry, in their order."""
+    started = time.perf_counter()
     latest: _Pass | None = None
     for index in range(len(entries)):
         latest = _run_pass(
@@ -82,8 +119,6 @@ def run_timeline(
     assert latest is not None  # there is an entry
     taken = time.perf_counter() - started
     result = scene.result(latest.features, latest.latents, seconds_taken=taken, on_floor=False)
-    for motion in result:
-        motion.extra["timeline"] = entries
     return dataclasses.replace(result, control_error=latest.error)
 
 

@@ -209,6 +209,21 @@ class TLControl(MotionPipeline[TLControlPreset]):
             progress=progress,
         )
 
+    def refined_latents(
+        self,
+        latents: Float[Tensor, "B L C"],
+        valid: Bool[Tensor, "B L"],
+        targets: Float[Tensor, "B T J 3"],
+        mask: Bool[Tensor, "B T J 3"],
+        preset: TLControlPreset,
+        *,
+        terms: Sequence[JointTerm] = (),
+        progress: Progress | None = None,
+    ) -> Float[Tensor, "B L C"]:
+        """See :class:`MotionPipeline`."""
+        solution = self.optimize(latents, valid, targets, mask, preset, terms=terms, progress=progress)
+        return solution.latents
+
     @property
     def longest(self) -> int:
         """See :class:`MotionPipeline`."""
