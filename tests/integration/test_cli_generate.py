@@ -302,7 +302,7 @@ def test_a_motion_is_edited_under_the_controls_and_obstacles_of_files(
     ball = ControlFile(obstacles=[Sphere((9.0, 1.0, 0.0), 0.2)])
     controls = ControlFile([JointControl("head", [FRAMES - 1], [[0.0, 1.0, None]])], text="he walks on")
     command(
-        "generate", "--edit", source, "--keep", "0-0.4", "--preset", "fast", "--formats", "npz",
+        "generate", "--edit", source, "--keep", "0-0.4", "--preset", "fast", "--formats", "npz,glb",
         "--controls", save_controls(controls, tmp_path / "c.json"),
         "--obstacles", save_controls(ball, tmp_path / "o.json"),
         "--out", tmp_path, "--model", tiny_pipeline_folder,
@@ -310,6 +310,7 @@ def test_a_motion_is_edited_under_the_controls_and_obstacles_of_files(
     edited = Motion.load(tmp_path / "he-walks-on_0_0.npz")
     assert edited.extra["mask"].nonzero().tolist() == [[FRAMES - 1, 15, 0], [FRAMES - 1, 15, 1]]
     assert len(edited.extra["obstacles"]) == 1
+    assert (tmp_path / "he-walks-on_0_0.glb").read_bytes()[:4] == b"glTF"
 
 
 @pytest.mark.parametrize(

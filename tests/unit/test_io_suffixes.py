@@ -10,7 +10,7 @@ POSITIONS = 1e-5  # metres; six decimal digits of a BVH
 
 
 def test_every_format_is_registered():
-    assert {"npz", "npy", "bvh", "png", "gif", "mp4"} <= set(known_suffixes())
+    assert {"npz", "npy", "bvh", "glb", "png", "gif", "mp4"} <= set(known_suffixes())
 
 
 @pytest.mark.parametrize("suffix", ["npz", "npy", "bvh", "BVH"])

@@ -65,7 +65,7 @@ def generate(
     ] = None,
     seed: Annotated[int, typer.Option(help="Same seed, same motions.")] = 0,
     formats: Annotated[
-        str, typer.Option(help="Files to write, comma-separated: npz, npy, bvh, png, gif, mp4.")
+        str, typer.Option(help="Files to write, comma-separated: npz, npy, bvh, glb, png, gif, mp4.")
     ] = "npz,bvh,png",
     out: Annotated[Path, typer.Option(help="Folder for the files; is made.")] = Path("out"),
     model: Annotated[
@@ -136,7 +136,7 @@ def generate(
         for suffix in suffixes
     ]
     if not quiet:
-        typer.echo(_report(result, has_bvh="bvh" in suffixes) + "\n")
+        typer.echo(_report(result, has_fit=bool({"bvh", "glb"} & set(suffixes))) + "\n")
     typer.echo("\n".join(map(str, files)))
 
 
@@ -185,7 +185,7 @@ def _chosen_seconds(seconds: float | None, document: ControlFile | None, path: P
     return document.seconds
 
 
-def _report(result: GenerationResult, *, has_bvh: bool) -> str:
+def _report(result: GenerationResult, *, has_fit: bool) -> str:
     """One row a sample. All samples are generated together, so each takes an equal share of the time."""
     import torch
 
@@ -201,7 +201,7 @@ def _report(result: GenerationResult, *, has_bvh: bool) -> str:
         has_obstacles = "obstacles" in motion.extra
         error = f"{100 * result.control_error[index].item() / unit:.2f}" if has_targets else "-"
         depth = f"{100 * result.penetration[index].item():.2f}" if has_obstacles else "-"
-        fit = f"{1000 * fit_rotations(motion.joints, skeleton).mean_error / unit:.1f}" if has_bvh else "-"
+        fit = f"{1000 * fit_rotations(motion.joints, skeleton).mean_error / unit:.1f}" if has_fit else "-"
         share = result.seconds_taken / len(result)
         rows.append((str(index), error, depth, f"{skating[index].item():.3f}", fit, f"{share:.1f}"))
     return format_table(_TITLES, rows)

@@ -78,14 +78,14 @@ def _hierarchy(fit: RotationFit, scale: float) -> Iterator[str]:
         root_channels = "" if open_joints else "Xposition Yposition Zposition "
         yield f"{indent}\tCHANNELS {3 if open_joints else 6} {root_channels}{rotations}"
         if not children_of(joint, fit.skeleton):
-            tip = _numbers(_tip(joint, fit) * scale)
+            tip = _numbers(bone_tip(joint, fit) * scale)
             yield from (f"{indent}\tEnd Site", f"{indent}\t{{", f"{indent}\t\tOFFSET {tip}", f"{indent}\t}}")
         open_joints.append(joint)
     for depth in reversed(range(len(open_joints))):
         yield "\t" * depth + "}"
 
 
-def _tip(joint: int, fit: RotationFit) -> np.ndarray:
+def bone_tip(joint: int, fit: RotationFit) -> np.ndarray:
     """End of a leaf bone relative to its joint: skull up, toes level, hand along the lower arm."""
     bone = fit.offsets[joint].numpy()
     length = float(np.linalg.norm(bone))

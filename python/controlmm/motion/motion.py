@@ -78,7 +78,7 @@ class Motion:
         return self.num_frames / self.fps
 
     def save(self, path: str | Path, **options: Any) -> Path:
-        """Write the motion in the format that the suffix names: npz, npy, bvh, png, gif, mp4 (and plugins).
+        """Write the motion in the format that the suffix names: npz, npy, bvh, glb, png, gif, mp4.
 
         Options belong to the format, see ``controlmm.io`` and ``controlmm.viewer``. Missing parent folders
         are made. Returns the path.
