@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from controlmm.controls import JointControl, PathControl
+from controlmm.generation.code_prediction import CodePrediction
 from controlmm.generation.code_sampling import draw_part_codes
 from controlmm.generation.noise import clip_seeds
 from controlmm.models.part_vq_vae import PartVqVae, PartVqVaeConfig
@@ -154,6 +155,32 @@ def test_temperature_zero_takes_the_most_likely_codes(tiny_tlcontrol):
     assert torch.equal(latents[1], latents[0])
 
 
+def test_a_part_varies_however_cold_the_draws_are(tiny_tlcontrol):
+    latents = part_latents(tiny_tlcontrol, vary="left_arm", preset=TLControlPreset(temperature=0.0))
+    assert (latents[1][:, 2] - latents[0][:, 2]).abs().max() > 0
+    assert torch.equal(latents[1][:, 3], latents[0][:, 3])
+
+
+def test_a_round_shows_the_network_its_own_trajectories_where_nothing_is_given(tiny_tlcontrol):
+    frames, tokens = 24, 6
+    valid = torch.ones(1, tokens, dtype=torch.bool)
+    text = tiny_tlcontrol.text_encoder.encode([PROMPT]).pooled
+    prediction = CodePrediction(tiny_tlcontrol.transformer, tiny_tlcontrol.decoder, text, valid, [3])
+    targets, mask = torch.zeros(1, frames, 22, 3), torch.zeros(1, frames, 22, 3, dtype=torch.bool)
+    targets[:, :, 20] = torch.tensor([0.4, 1.2, 0.3])
+    mask[:, :, 20] = True
+    first = prediction.latents(targets, mask, rounds=0, temperature=0.5)
+    motion = tiny_tlcontrol.decoder(first, torch.ones(1, frames, dtype=torch.bool))
+    own = targets.where(mask, motion)
+    everything = mask.clone()
+    everything[:, :, list(tiny_tlcontrol.transformer.config.joints)] = True
+    expected = prediction.latents(own, everything, rounds=0, temperature=0.0)
+    assert torch.equal(prediction.latents(targets, mask, rounds=1, temperature=0.5), expected)
+    assert not torch.equal(expected, first)
+    given = prediction.latents(own, everything, rounds=3, temperature=0.5)
+    assert torch.equal(given, expected)  # nothing is left to fill
+
+
 def test_every_token_is_a_fair_draw_from_its_logits():
     logits = torch.tensor([2.0, 1.0, 0.0, -1.0]).expand(1, 1, 1, 4).clone()
     counts = torch.zeros(4)
@@ -294,6 +321,7 @@ def test_a_preset_of_controlmm_is_refused(tiny_tlcontrol):
         ({"loss": "l2"}, "`loss` must be one of half_square, smooth_l1, norm_sum, got 'l2'"),
         ({"foot": "toe"}, "`foot` must be one of contact, published, none, got 'toe'"),
         ({"vary": "arm"}, "Unknown body part 'arm'"),
+        ({"rounds": -1}, "`rounds` must be a whole number of at least 0, got -1"),
     ],
 )
 def test_impossible_presets_are_refused(changes, message):

@@ -14,7 +14,7 @@ _STREAMS = 64  # more than parts; keeps the streams of neighbouring seeds apart
 
 
 def draw_part_codes(
-    logits: Float[Tensor, "B L P K"], seeds: Sequence[int], *, temperature: float, varied: int | None = None
+    logits: Float[Tensor, "B L P K"], seeds: Sequence[int], *, temperature: float
 ) -> Int[Tensor, "B L P"]:
     """Code ids, one draw from ``softmax(logits / temperature)`` for every token of every part.
 
@@ -25,15 +25,13 @@ def draw_part_codes(
         logits: Of the trajectory transformer.
         seeds: One a clip; every part has a stream of its own, whatever the batch or padding.
         temperature: 0 takes the most likely codes, as the paper does.
-        varied: Part that differs from clip to clip; all others take the first clip's noise.
     """
     if temperature == 0:
         return logits.argmax(-1)
     batch, _, parts, codes = logits.shape
     drawn = []
     for part in range(parts):
-        own = seeds if varied in (None, part) else [seeds[0]] * batch
-        noise = ClipNoise([(seed * _STREAMS + part) % 2**63 for seed in own])
+        noise = ClipNoise([(seed * _STREAMS + part) % 2**63 for seed in seeds])
         gumbel = noise.gumbel([1] * batch, padded=1, width=codes)
         drawn.append((logits[:, :, part] + temperature * gumbel).argmax(-1))
     return torch.stack(drawn, dim=-1)

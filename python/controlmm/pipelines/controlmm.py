@@ -5,8 +5,8 @@ Source: Pinyoanuntapong et al., ControlMM / MaskControl, ICCV 2025.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -35,14 +35,13 @@ from controlmm.models.rvq_vae import RvqVae, frame_mask
 from controlmm.motion.motion import Motion
 from controlmm.motion.normalizer import Normalizer
 from controlmm.nn.checkpoint import PretrainedModel
-from controlmm.pipelines import folder as files
 from controlmm.pipelines.adjusting import adjusted
 from controlmm.pipelines.checks import check_masks_end, check_sizes
 from controlmm.pipelines.motion_editing import run_edit
 from controlmm.pipelines.output import GenerationResult
 from controlmm.pipelines.pipeline import MotionPipeline
 from controlmm.pipelines.presets import Preset, resolve_preset, with_limits
-from controlmm.text import TextEncoder, check_same_encoder, load_text_encoder
+from controlmm.text import TextEncoder
 
 
 class ControlMM(MotionPipeline[Preset]):
@@ -55,6 +54,13 @@ class ControlMM(MotionPipeline[Preset]):
     """
 
     kind = "controlmm"
+    network_classes: ClassVar[Mapping[str, type[PretrainedModel]]] = {
+        "tokenizer": RvqVae,
+        "transformer": MaskedTransformer,
+        "residual": ResidualTransformer,
+        "control": ControlBranch,
+        "length": LengthEstimator,
+    }
 
     def __init__(
         self,
@@ -78,55 +84,12 @@ class ControlMM(MotionPipeline[Preset]):
             length=None if length is None else length.config,
         )
         self.length = None if length is None else length.eval().requires_grad_(False)
+        self.tokenizer = tokenizer
         self.transformer = transformer.eval().requires_grad_(False)
         self.residual = residual.eval().requires_grad_(False)
         self.control = control.eval().requires_grad_(False)
         self.decoder = MotionDecoder(tokenizer, normalizer)
         self.text_encoder = text_encoder
-
-    @classmethod
-    def from_pretrained(
-        cls, path: str | Path | None = None, *, text_encoder: TextEncoder | None = None
-    ) -> ControlMM:
-        """Load a pipeline folder; without a path, the trained model that comes with the package.
-
-        Args:
-            path: A folder written by :meth:`save_pretrained`.
-            text_encoder: Use this one instead of loading the one that the folder names; it must equal it.
-
-        Raises:
-            FileNotFoundError: If the folder or one of its files is missing.
-            ValueError: If a file is damaged, or the text encoder is not the one used in training.
-            ModuleNotFoundError: If the text encoder's weights are not installed.
-        """
-        folder = files.resolve_folder(path)
-        files.check_kind(folder, cls.kind)
-        encoder_config = files.read_json(folder / files.TEXT_ENCODER_FILE)
-        if text_encoder is None:
-            text_encoder = load_text_encoder(encoder_config)
-        else:
-            check_same_encoder(encoder_config, text_encoder)
-        return cls(
-            tokenizer=RvqVae.from_pretrained(folder / "tokenizer"),
-            transformer=MaskedTransformer.from_pretrained(folder / "transformer"),
-            residual=ResidualTransformer.from_pretrained(folder / "residual"),
-            control=ControlBranch.from_pretrained(folder / "control"),
-            normalizer=Normalizer.load(folder / files.NORMALIZER_FILE),
-            text_encoder=text_encoder,
-            length=LengthEstimator.from_pretrained(folder / "length")
-            if (folder / "length").is_dir()
-            else None,
-        )
-
-    def networks(self) -> dict[str, PretrainedModel]:
-        """See :class:`MotionPipeline`."""
-        return {
-            "tokenizer": self.decoder.tokenizer,
-            "transformer": self.transformer,
-            "residual": self.residual,
-            "control": self.control,
-            **({} if self.length is None else {"length": self.length}),
-        }
 
     def resolve_preset(self, preset: str | Preset, guidance_scale: float | None) -> Preset:
         """See :class:`MotionPipeline`."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import ClassVar, Generic, TypeVar
+from typing import ClassVar, Generic, Self, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -20,6 +20,7 @@ from controlmm.generation.noise import clip_seeds
 from controlmm.generation.solvers import Progress
 from controlmm.generation.terms import JointTerm
 from controlmm.models.length_estimator import LengthEstimator
+from controlmm.motion.normalizer import Normalizer
 from controlmm.motion.skeleton import Skeleton
 from controlmm.nn.checkpoint import PretrainedModel
 from controlmm.pipelines import folder as files
@@ -30,7 +31,7 @@ from controlmm.pipelines.output import GenerationResult
 from controlmm.pipelines.reach import check_reach
 from controlmm.pipelines.scene import Scene
 from controlmm.pipelines.timeline import TimelineMethod, run_timeline
-from controlmm.text import TextEncoder, check_prompt
+from controlmm.text import TextEncoder, check_prompt, check_same_encoder, load_text_encoder
 
 MAX_FRAMES = 196
 
@@ -41,7 +42,10 @@ _Plan = TypeVar("_Plan")  # a pipeline's kind of preset
 class MotionPipeline(ABC, Generic[_Plan]):
     """Text plus 3D control in, motions out. A subclass says how the latents of a batch are made."""
 
-    kind: ClassVar[str]  # in pipeline.json
+    kind: ClassVar[str]  # in pipeline.json, and the name of the model that comes with the package
+    # By the names of their folders, which are those of the constructor's arguments and of attributes.
+    network_classes: ClassVar[Mapping[str, type[PretrainedModel]]]
+    optional_networks: ClassVar[tuple[str, ...]] = ("length",)
     decoder: MotionDecoder
     text_encoder: TextEncoder
     length: LengthEstimator | None = None  # draws the length of motions whose caller does not say
@@ -90,9 +94,41 @@ class MotionPipeline(ABC, Generic[_Plan]):
             ValueError: If there is none of that name.
         """
 
-    @abstractmethod
+    @classmethod
+    def from_pretrained(
+        cls, path: str | Path | None = None, *, text_encoder: TextEncoder | None = None
+    ) -> Self:
+        """Load a pipeline folder; without a path, the trained model that comes with the package.
+
+        Args:
+            path: A folder written by :meth:`save_pretrained`.
+            text_encoder: Use this one instead of loading the one that the folder names; it must equal it.
+
+        Raises:
+            FileNotFoundError: If the folder or one of its files is missing.
+            ValueError: If a file is damaged, or the text encoder is not the one used in training.
+            ModuleNotFoundError: If the text encoder's weights are not installed.
+        """
+        folder = files.resolve_folder(path, shipped=cls.kind)
+        files.check_kind(folder, cls.kind)
+        encoder_config = files.read_json(folder / files.TEXT_ENCODER_FILE)
+        if text_encoder is None:
+            text_encoder = load_text_encoder(encoder_config)
+        else:
+            check_same_encoder(encoder_config, text_encoder)
+        networks = {
+            name: network.from_pretrained(folder / name)
+            for name, network in cls.network_classes.items()
+            if name not in cls.optional_networks or (folder / name).is_dir()
+        }
+        normalizer = Normalizer.load(folder / files.NORMALIZER_FILE)
+        assembled: Callable[..., Self] = cls  # every subclass takes its networks by these names
+        return assembled(**networks, normalizer=normalizer, text_encoder=text_encoder)
+
     def networks(self) -> dict[str, PretrainedModel]:
         """All networks by the names of their folders."""
+        found = {name: getattr(self, name) for name in self.network_classes}
+        return {name: network for name, network in found.items() if network is not None}
 
     @torch.no_grad()
     def __call__(

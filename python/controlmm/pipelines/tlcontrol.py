@@ -6,16 +6,15 @@ Source: Wan et al., TLControl: Trajectory and Language Control for Human Motion 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from controlmm.generation.code_optimization import optimize_codes
-from controlmm.generation.code_sampling import draw_part_codes
+from controlmm.generation.code_prediction import CodePrediction
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.solvers import Progress, Solution
 from controlmm.generation.terms import JointTerm
@@ -26,12 +25,11 @@ from controlmm.models.trajectory_transformer import TrajectoryTransformer
 from controlmm.motion.body_parts import part_index
 from controlmm.motion.normalizer import Normalizer
 from controlmm.nn.checkpoint import PretrainedModel
-from controlmm.pipelines import folder as files
 from controlmm.pipelines.checks import check_masks_end, check_tlcontrol_sizes
 from controlmm.pipelines.output import GenerationResult
 from controlmm.pipelines.pipeline import MAX_FRAMES, MotionPipeline
 from controlmm.pipelines.tlcontrol_presets import TLControlPreset, resolve_tlcontrol_preset
-from controlmm.text import TextEncoder, check_same_encoder, load_text_encoder
+from controlmm.text import TextEncoder
 
 
 class TLControl(MotionPipeline[TLControlPreset]):
@@ -47,6 +45,11 @@ class TLControl(MotionPipeline[TLControlPreset]):
     """
 
     kind = "tlcontrol"
+    network_classes: ClassVar[Mapping[str, type[PretrainedModel]]] = {
+        "tokenizer": PartVqVae,
+        "transformer": TrajectoryTransformer,
+        "length": LengthEstimator,
+    }
 
     def __init__(
         self,
@@ -69,46 +72,6 @@ class TLControl(MotionPipeline[TLControlPreset]):
         self.transformer = transformer.eval().requires_grad_(False)
         self.decoder = MotionDecoder(tokenizer, normalizer)
         self.text_encoder = text_encoder
-
-    @classmethod
-    def from_pretrained(
-        cls, path: str | Path | None = None, *, text_encoder: TextEncoder | None = None
-    ) -> TLControl:
-        """Load a pipeline folder; without a path, the trained model that comes with the package.
-
-        Args:
-            path: A folder written by :meth:`save_pretrained`.
-            text_encoder: Use this one instead of loading the one that the folder names; it must equal it.
-
-        Raises:
-            FileNotFoundError: If the folder or one of its files is missing.
-            ValueError: If a file is damaged, or the text encoder is not the one used in training.
-            ModuleNotFoundError: If the text encoder's weights are not installed.
-        """
-        folder = files.resolve_folder(path, shipped=cls.kind)
-        files.check_kind(folder, cls.kind)
-        encoder_config = files.read_json(folder / files.TEXT_ENCODER_FILE)
-        if text_encoder is None:
-            text_encoder = load_text_encoder(encoder_config)
-        else:
-            check_same_encoder(encoder_config, text_encoder)
-        return cls(
-            tokenizer=PartVqVae.from_pretrained(folder / "tokenizer"),
-            transformer=TrajectoryTransformer.from_pretrained(folder / "transformer"),
-            normalizer=Normalizer.load(folder / files.NORMALIZER_FILE),
-            text_encoder=text_encoder,
-            length=LengthEstimator.from_pretrained(folder / "length")
-            if (folder / "length").is_dir()
-            else None,
-        )
-
-    def networks(self) -> dict[str, PretrainedModel]:
-        """See :class:`MotionPipeline`."""
-        return {
-            "tokenizer": self.tokenizer,
-            "transformer": self.transformer,
-            **({} if self.length is None else {"length": self.length}),
-        }
 
     def __call__(
         self,
@@ -164,7 +127,16 @@ class TLControl(MotionPipeline[TLControlPreset]):
         check_masks_end(mask, lengths)
         valid = self._valid_tokens(lengths)
         targets, mask = (_padded(x, valid.shape[1] * self.decoder.downsample) for x in (targets, mask))
-        latents = self._predicted(text, valid, targets, mask, seeds, preset)
+        prediction = CodePrediction(
+            self.transformer, self.decoder, text, valid, seeds, guidance_scale=preset.guidance_scale
+        )
+        latents = prediction.latents(
+            targets,
+            mask,
+            rounds=preset.rounds,
+            temperature=preset.temperature,
+            varied=None if preset.vary is None else part_index(preset.vary),
+        )
         is_edited = mask.flatten(1).any(1) | bool(terms)
         rows = is_edited.nonzero()[:, 0]
         if preset.iterations and len(rows):
@@ -238,24 +210,6 @@ class TLControl(MotionPipeline[TLControlPreset]):
     def _valid_tokens(self, lengths: Sequence[int]) -> Bool[Tensor, "B L"]:
         tokens = torch.tensor([self.padded_frames(length) // self.decoder.downsample for length in lengths])
         return frame_mask(tokens, int(tokens.max()))
-
-    def _predicted(
-        self,
-        text: Tensor,
-        valid: Tensor,
-        targets: Tensor,
-        mask: Tensor,
-        seeds: Sequence[int],
-        preset: TLControlPreset,
-    ) -> Float[Tensor, "B L C"]:
-        trajectories, given = self.transformer.trajectories(targets, mask)
-        logits = self.transformer(trajectories, given, text, valid)
-        if preset.guidance_scale != 1:
-            without = self.transformer(trajectories, given, torch.zeros_like(text), valid)
-            logits = without + preset.guidance_scale * (logits - without)
-        varied = None if preset.vary is None else part_index(preset.vary)
-        ids = draw_part_codes(logits, seeds, temperature=preset.temperature, varied=varied)
-        return self.tokenizer.quantizer.lookup(ids.where(valid[..., None], -1))
 
 
 def _padded(dense: Tensor, frames: int) -> Tensor:

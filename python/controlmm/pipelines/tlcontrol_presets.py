@@ -17,11 +17,14 @@ class TLControlPreset(CodeOptimization):
             alike.
         guidance_scale: How strongly the text counts; 1 is the paper's. Above it, predicted codes may not fit
             unusual paths any more, and the optimisation starts too far away.
+        rounds: Passes of the network before the last one, each with the six trajectories of the motion that
+            the one before drew: feet then agree with the way. The paper has none.
         vary: Only this body part differs between samples; ``None``: all do.
     """
 
     temperature: float = 0.5
     guidance_scale: float = 1.0
+    rounds: int = 3
     vary: str | None = None
 
     def __post_init__(self) -> None:
@@ -30,6 +33,8 @@ class TLControlPreset(CodeOptimization):
             raise ValueError(f"`temperature` must be a number of at least 0, got {self.temperature!r}.")
         if not is_number(self.guidance_scale):
             raise ValueError(f"`guidance_scale` must be a finite number, got {self.guidance_scale!r}.")
+        if isinstance(self.rounds, bool) or not isinstance(self.rounds, int) or self.rounds < 0:
+            raise ValueError(f"`rounds` must be a whole number of at least 0, got {self.rounds!r}.")
         if self.vary is not None:
             part_index(self.vary)
 
@@ -39,7 +44,7 @@ TLCONTROL_PRESETS = {
     "balanced": TLControlPreset(),
     "accurate": TLControlPreset(tolerance=1e-8),
     "paper": TLControlPreset(
-        temperature=0.0, guidance_scale=1.0, rate=0.1, loss="smooth_l1", foot="published"
+        temperature=0.0, guidance_scale=1.0, rounds=0, rate=0.1, loss="smooth_l1", foot="published"
     ),
 }
 
