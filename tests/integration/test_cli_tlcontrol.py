@@ -49,3 +49,14 @@ def test_vary_needs_tlcontrol(refused, tiny_pipeline_folder, tmp_path):
         "--out", tmp_path,
     )  # fmt: skip
     assert "`--vary` needs a TLControl model" in error
+
+
+def test_a_motion_is_edited(generate, command, tiny_tlcontrol_folder, tmp_path):
+    (source,) = generate(tiny_tlcontrol_folder, "--quiet").split()
+    printed = command(
+        "generate", "a person jumps", "--edit", source, "--keep", "0-0.4", "--model", tiny_tlcontrol_folder,
+        "--preset", "fast", "--formats", "npz", "--out", tmp_path / "edited", "--quiet",
+    )  # fmt: skip
+    edited = Motion.load(printed.strip())
+    assert edited.num_frames == 20
+    assert edited.text == "a person jumps"

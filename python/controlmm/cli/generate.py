@@ -113,8 +113,6 @@ def generate(
     from controlmm.pipelines import ControlMM, TLControl, load_pipeline
 
     pipeline = load_pipeline(model)
-    if source is not None and not isinstance(pipeline, ControlMM):
-        raise ValueError("`--edit` needs a ControlMM model; TLControl predicts all codes from its controls.")
     if vary is not None and not isinstance(pipeline, TLControl):
         raise ValueError("`--vary` needs a TLControl model, for example: --model tlcontrol.")
     parts: dict[str, Any] = {} if vary is None else {"vary": vary}
@@ -122,7 +120,8 @@ def generate(
         options |= {"progress": bars, **parts}
         if entries:
             result = pipeline.timeline(entries, controls=held, obstacles=avoided, **options)
-        elif source is not None and isinstance(pipeline, ControlMM):
+        elif source is not None:
+            assert isinstance(pipeline, ControlMM | TLControl)
             result = pipeline.edit(
                 source, prompt, keep=intervals, keep_parts=keep_part or (), controls=held, obstacles=avoided,
                 exact=not loose, **options,

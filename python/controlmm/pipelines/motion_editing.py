@@ -89,7 +89,7 @@ def run_edit(
         may_change = may_change[..., None].float()
         latents = edit_latents(objective, latents, may_change, preset.budget, progress=progress).latents
     features = pipeline.decoder.features(latents)[:, :frames]
-    return _result(scene, features, latents, started)
+    return edit_result(scene, features, latents, started)
 
 
 def _tokens(pipeline: ControlMM, scene: EditScene, padded: int) -> Int[Tensor, "1 L Q"]:
@@ -168,10 +168,10 @@ def _objective(
     return ControlObjective(pipeline.decoder, targets, mask, frames, norm=preset.control_norm, terms=terms)
 
 
-def _result(
+def edit_result(
     scene: EditScene, features: Float[Tensor, "B T D"], latents: Float[Tensor, "B L C"], started: float
 ) -> GenerationResult:
-    """Motions in the world of the source, measured there."""
+    """Motions in the world of the source, measured there; ``started`` is what the clock said then."""
     source, controls = scene.source, scene.controls
     joints = source.placed(recover_joints(features, joints=scene.skeleton.num_joints))
     world = source.placed(source.joints)

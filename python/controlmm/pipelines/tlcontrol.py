@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from controlmm.controls import Avoid, Control, Objective, Obstacle
 from controlmm.generation.code_optimization import optimize_codes
 from controlmm.generation.code_prediction import CodePrediction
 from controlmm.generation.motion_decoder import MotionDecoder
@@ -23,10 +24,13 @@ from controlmm.models.part_vq_vae import PartVqVae
 from controlmm.models.rvq_vae import frame_mask
 from controlmm.models.trajectory_transformer import TrajectoryTransformer
 from controlmm.motion.body_parts import part_index
+from controlmm.motion.motion import Motion
 from controlmm.motion.normalizer import Normalizer
 from controlmm.nn.checkpoint import PretrainedModel
-from controlmm.pipelines.checks import check_masks_end, check_tlcontrol_sizes
+from controlmm.pipelines.checks import check_masks_end, check_sampling, check_tlcontrol_sizes
+from controlmm.pipelines.edit_scene import EditScene
 from controlmm.pipelines.output import GenerationResult
+from controlmm.pipelines.part_editing import run_part_edit
 from controlmm.pipelines.pipeline import MAX_FRAMES, MotionPipeline
 from controlmm.pipelines.tlcontrol_presets import TLControlPreset, resolve_tlcontrol_preset
 from controlmm.text import TextEncoder
@@ -99,6 +103,51 @@ class TLControl(MotionPipeline[TLControlPreset]):
         if vary is not None:
             plan = dataclasses.replace(plan, vary=vary)
         return super().__call__(prompt, preset=plan, **call)
+
+    @torch.no_grad()
+    def edit(
+        self,
+        motion: Motion,
+        prompt: str,
+        *,
+        keep: Sequence[tuple[float, float]] = (),
+        keep_parts: Sequence[str] = (),
+        controls: Sequence[Control] = (),
+        obstacles: Sequence[Obstacle | Avoid] = (),
+        objectives: Sequence[Objective] = (),
+        exact: bool = True,
+        samples: int = 1,
+        preset: str | TLControlPreset = "balanced",
+        guidance_scale: float | None = None,
+        seed: int = 0,
+        progress: Progress | None = None,
+    ) -> GenerationResult:
+        """Change a motion that exists, see :meth:`ControlMM.edit`; something must be kept.
+
+        The network sees the six trajectories of what is kept; tokens that are kept whole have the motion's
+        own codes; then all codes are optimised until what is kept, and controls, are where they should be.
+
+        Raises:
+            TypeError: If an argument has the wrong type; nothing has run then.
+            ValueError: If an argument is unusable, nothing or everything is kept, or what is kept contradicts
+                controls or obstacles; nothing has run then.
+        """
+        check_sampling(samples=samples, seed=seed)
+        plan = self.inexact(preset, guidance_scale)
+        scene = EditScene.of_call(
+            motion,
+            prompt,
+            keep=keep,
+            keep_parts=keep_parts,
+            controls=controls,
+            obstacles=obstacles,
+            objectives=objectives,
+            skeleton=self.skeleton,
+            max_frames=MAX_FRAMES,
+        )
+        return run_part_edit(
+            self, scene, exact=exact, samples=samples, preset=plan, seed=seed, progress=progress
+        )
 
     def resolve_preset(self, preset: str | TLControlPreset, guidance_scale: float | None) -> TLControlPreset:
         """See :class:`MotionPipeline`."""
