@@ -106,7 +106,7 @@ class MotionTextMatcher(PretrainedModel):
         x = self._kept(x.transpose(1, 2), snippets * SNIPPET)  # (B, D, T)
         x = self._kept(self.dropout(nn.functional.leaky_relu(self.first(x), 0.2)), snippets * 2)
         x = self.dropout(nn.functional.leaky_relu(self.second(x), 0.2)).transpose(1, 2)  # (B, L, W)
-        packed = pack_padded_sequence(x, snippets, batch_first=True, enforce_sorted=False)
+        packed = pack_padded_sequence(x, snippets.cpu(), batch_first=True, enforce_sorted=False)
         states, _ = pad_packed_sequence(self.recurrent(packed)[0], batch_first=True)  # zero in padding
         return self._on_sphere(self.motion_head(states.sum(1) / snippets[:, None]))
 

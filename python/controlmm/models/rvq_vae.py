@@ -101,4 +101,4 @@ class RvqVae(MotionTokenizer):
 
 def frame_mask(lengths: Int[Tensor, "B"], frames: int) -> Bool[Tensor, "B T"]:
     """True for the first ``lengths[b]`` of ``frames`` frames."""
-    return torch.arange(frames) < lengths[:, None]
+    return torch.arange(frames, device=lengths.device) < lengths[:, None]

@@ -82,7 +82,7 @@ class SequenceEncoder(nn.Module):
     def forward(self, sequence: Float[Tensor, "B L C"], lengths: Int[Tensor, "B"]) -> Float[Tensor, "B E"]:
         """Rows in the order of the input: the published code leaves them sorted by length."""
         packed = pack_padded_sequence(
-            self.input_emb(sequence), lengths, batch_first=True, enforce_sorted=False
+            self.input_emb(sequence), lengths.cpu(), batch_first=True, enforce_sorted=False
         )
         _, last = self.gru(packed, self.hidden.expand(-1, len(sequence), -1).contiguous())
         embedding: Tensor = self.output_net(torch.cat([last[0], last[1]], dim=-1))

@@ -52,7 +52,7 @@ class EvaluatorRecipe:
         """Loss of a random batch and how often the right motion comes first."""
         batch = self._train.sample(batch_size)
         scores = self._scores(batch)
-        first = (scores.argmax(1) == torch.arange(len(scores))).float().mean()
+        first = (scores.argmax(1) == torch.arange(len(scores), device=scores.device)).float().mean()
         return {"loss": contrastive_loss(scores, batch.is_negative), "top1": first}
 
     def validate(self) -> dict[str, float]:
@@ -66,7 +66,7 @@ class EvaluatorRecipe:
                 rank = (scores > scores.diagonal()[:, None]).sum(1)
                 hits.append(torch.stack([(rank < k).float().mean() for k in (1, 2, 3)]))
                 losses.append(contrastive_loss(scores, batch.is_negative))
-        r1, r2, r3 = torch.stack(hits).mean(0).tolist()
+        r1, r2, r3 = (share.item() for share in torch.stack(hits).mean(0))
         return {
             "score": 1 - (r1 + r2 + r3) / 3, "r1": r1, "r2": r2, "r3": r3,
             "loss": torch.stack(losses).mean().item(),
@@ -78,15 +78,16 @@ class EvaluatorRecipe:
 
     def _scores(self, batch: PairBatch) -> Float[Tensor, "B B"]:
         """Sharpened cosines, sentence by motion."""
-        motions = self.model.embed_motions(batch.features, batch.lengths)
-        return _SHARPNESS * self.model.embed_texts(batch.text) @ motions.T
+        device = self.model.device
+        motions = self.model.embed_motions(batch.features.to(device), batch.lengths.to(device))
+        return _SHARPNESS * self.model.embed_texts(batch.text.to(device)) @ motions.T
 
 
 def contrastive_loss(scores: Float[Tensor, "B B"], is_negative: Bool[Tensor, "B B"]) -> Float[Tensor, ""]:
     """Mean of the text-to-motion and the motion-to-text cross-entropy over the sure negatives."""
-    own = torch.eye(len(scores), dtype=torch.bool)
-    scores = scores.masked_fill(~(is_negative | own), -torch.inf)
-    target = torch.arange(len(scores))
+    own = torch.eye(len(scores), dtype=torch.bool, device=scores.device)
+    scores = scores.masked_fill(~(is_negative.to(scores.device) | own), -torch.inf)
+    target = torch.arange(len(scores), device=scores.device)
     return (cross_entropy(scores, target) + cross_entropy(scores.T, target)) / 2
 
 

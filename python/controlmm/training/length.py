@@ -106,9 +106,10 @@ class LengthRecipe:
         return {"stage": "length"}
 
     def _losses(self, pairs: LengthPairs, rows: Int[Tensor, "B"]) -> dict[str, Tensor]:
-        logits = self.model(pairs.text[rows]).float()
-        tokens = pairs.tokens[rows]
-        expected = logits.softmax(-1) @ torch.arange(logits.shape[1], dtype=logits.dtype)
+        device = self.model.device
+        logits = self.model(pairs.text[rows].to(device)).float()
+        tokens = pairs.tokens[rows].to(device)
+        expected = logits.softmax(-1) @ torch.arange(logits.shape[1], dtype=logits.dtype, device=device)
         return {
             "loss": cross_entropy(logits, tokens),
             "frames_off": (expected - tokens).abs().mean() * _FRAMES_A_TOKEN,
