@@ -1,131 +1,137 @@
-"""Solvers of latent editing on test clips, and what one evaluation costs.
+"""The table of editing: what every solver reaches, in which time, at which cost in naturalness.
 
-python -m benchmarks.editing --data DATA [--model FOLDER] [--clips 8] [--solvers gauss-newton lbfgs ...]
-python -m benchmarks.editing --evaluation
+    python -m benchmarks.editing --data DATA [--split test] [--limit 32] [--seed 0] [--out out/editing]
+    python -m benchmarks.editing --evaluation
 
-Every solver starts from the same latents (masked decoding of the clip's caption and targets, without logits
-editing). Times are processor seconds of the solving alone, so that a busy machine does not count; medians
-over clips.
+Clips of the split, each with its own recording as target: the pelvis, each other of the six joints, one of
+their 63 combinations ("cross"), at 1, 2, 5 keyframes, a quarter and all frames. Every solver starts from the
+same tokens. Errors, seconds and evaluations are medians over clips; seconds are processor seconds of the
+editing of one clip alone, so that a busy machine does not count. FID, R-precision and the distance to the
+text are those of the in-project evaluator. The slowest solvers come last, a killed run goes on where it was,
+and the tables are written after every row.
+
+``--evaluation`` prints what one evaluation of a paper-sized decoder costs, by part.
 """
 
 from __future__ import annotations
 
 import argparse
-import itertools
-import time
-from dataclasses import dataclass
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from benchmarks.decoder_evaluation import print_evaluations
+from benchmarks.editing_rows import PLANS, REAL, Bench
+from benchmarks.progress_file import Row, known_rows, measured_rows
 from controlmm import ControlMM
-from controlmm.data import MotionFolder
-from controlmm.evaluation import foot_skating_ratio
-from controlmm.generation.editing import EditingBudget
-from controlmm.generation.exact import meet_exactly
-from controlmm.generation.latent_editing import edit_latents
-from controlmm.generation.noise import clip_seeds
-from controlmm.generation.objective import ControlObjective, control_error
+from controlmm.evaluation.control_draws import DENSITIES, ControlSetting
+from controlmm.evaluation.evaluators import load_evaluator
+from controlmm.evaluation.protocol import Protocol
+from controlmm.evaluation.test_set import read_test_set
 from controlmm.motion.skeleton import HUMANML3D
-from controlmm.ops import recover_joints
-from controlmm.pipelines import Preset
+from controlmm.text.encoder import weights_sha256
 
-FRAMES = 196
-SIX = HUMANML3D.control_joints
-BUDGETS = {
-    "paper (600 AdamW)": EditingBudget(latent_iterations=600),
-    "lbfgs": EditingBudget(latent_iterations=100, solver="lbfgs", tolerance=0.001),
-    "gauss-newton": EditingBudget(latent_iterations=60, solver="gauss-newton", tolerance=0.001),
-    "exact": EditingBudget(latent_iterations=60, solver="gauss-newton", tolerance=0.001),
+CONTROLS = (*(HUMANML3D.joint_names[joint] for joint in HUMANML3D.control_joints), "cross")
+_FRAMES = {1: "1", 2: "2", 5: "5", 49: "25 %", 196: "100 %"}
+_COLUMNS = {
+    "error (cm)": ("error_cm", "{:.3f}"),
+    "worst (cm)": ("worst_cm", "{:.2f}"),
+    "seconds": ("seconds", "{:.2f}"),
+    "evaluations": ("evaluations", "{:.0f}"),
+    "FID": ("fid", "{:.2f}"),
+    "R@3": ("r3", "{:.3f}"),
+    "to text": ("mm_distance", "{:.2f}"),
+    "skating": ("skating", "{:.4f}"),
+    "jerk": ("jerk", "{:.1f}"),
+    "bones (mm)": ("bones_mm", "{:.2f}"),
 }
 
 
-@dataclass(frozen=True)
-class Problem:
-    """Clips whose joints are to follow recorded ones."""
-
-    name: str
-    joints: tuple[tuple[int, ...], ...]  # of each clip
-    keys: int  # frames of each clip
+def keys_of(solvers: Sequence[str], controls: Sequence[str], densities: Sequence[int]) -> list[str]:
+    """Names of all rows, ``solver/control/density``: recordings once, then solver after solver."""
+    problems = [f"{control}/{density}" for control in controls for density in densities]
+    return [f"{REAL}/{problems[0]}", *(f"{solver}/{problem}" for solver in solvers for problem in problems)]
 
 
-def problems(clips: int) -> list[Problem]:
-    """Pelvis, each other joint and subsets of the six, at 1, 2, 5 frames, 25 % and 100 %."""
-    subsets = [s for size in range(1, 7) for s in itertools.combinations(SIX, size)]
-    spread = tuple(subsets[(7 * clip) % len(subsets)] for clip in range(clips))
-    names = {HUMANML3D.joint_names[joint]: ((joint,),) * clips for joint in SIX} | {"subsets of six": spread}
-    return [Problem(name, joints, keys) for name, joints in names.items() for keys in (1, 2, 5, 49, FRAMES)]
+def table(rows: Sequence[Row]) -> str:
+    """Markdown, one table a choice of joints, and the means over all of them."""
+    parts = []
+    measured = [row for row in rows if not row["key"].startswith(REAL)]
+    for control in dict.fromkeys(row["key"].split("/")[1] for row in measured):
+        own = [row for row in measured if row["key"].split("/")[1] == control]
+        own.sort(key=lambda row: int(row["key"].split("/")[2]))
+        cells = [(_FRAMES[int(row["key"].split("/")[2])], row["key"].split("/")[0], row) for row in own]
+        parts.append(f"## {control}\n\n{_markdown(('keys', 'solver'), cells)}")
+    means = [(*_wide(solver), _mean(solver, measured)) for solver in PLANS if _of(solver, measured)]
+    real = [(*_wide(REAL), row) for row in rows if row["key"].startswith(REAL)]
+    return "\n".join(
+        [f"## means over {_problems(measured)}\n\n{_markdown(('rows', 'solver'), real + means)}", *parts]
+    )
 
 
-def drawn(problem: Problem, joints: Tensor) -> Tensor:
-    """Which coordinates are controlled; the frames are drawn with a seed."""
-    generator = torch.Generator().manual_seed(problem.keys)
-    mask = torch.zeros(*joints.shape, dtype=torch.bool)
-    for clip, chosen in enumerate(problem.joints):
-        frames = torch.randperm(FRAMES, generator=generator)[: problem.keys]
-        for joint in chosen:
-            mask[clip, frames, joint] = True
-    return mask
+def _wide(solver: str) -> tuple[str, str]:
+    return "all", solver
 
 
-def row(pipeline: ControlMM, solver: str, start: Tensor, targets: Tensor, mask: Tensor) -> dict[str, float]:
-    """Medians over the clips for one solver: each clip is solved alone."""
-    decoder, values = pipeline.decoder, []
-    for clip in range(len(start)):
-        one = slice(clip, clip + 1)
-        frames = torch.ones(1, FRAMES, dtype=torch.bool)
-        objective = ControlObjective(decoder, targets[one], mask[one], frames)
-        began = time.thread_time()
-        solution = edit_latents(objective, start[one], torch.ones(1, start.shape[1], 1), BUDGETS[solver])
-        features = decoder.features(solution.latents)
-        if solver == "exact":
-            features = meet_exactly(features[0], targets[clip], mask[clip], HUMANML3D)[0][None]
-        seconds = time.thread_time() - began
-        joints = recover_joints(features, joints=HUMANML3D.num_joints)
-        values.append(
-            (
-                100 * control_error(joints, targets[one], mask[one])[0],
-                seconds,
-                solution.evaluations[0],
-                foot_skating_ratio(joints)[0],
-                (joints.diff(n=3, dim=1) * HUMANML3D.fps**3).norm(dim=-1).mean(),
-            )
-        )
-    table = torch.tensor([[float(value) for value in one] for one in values])
-    middle = table.median(0).values
-    names = ("error (cm)", "seconds", "evaluations", "skating", "jerk")
-    return dict(zip(names, middle.tolist(), strict=True)) | {"worst (cm)": table[:, 0].max().item()}
+def _of(solver: str, rows: Sequence[Row]) -> list[Row]:
+    return [row for row in rows if row["key"].startswith(f"{solver}/")]
+
+
+def _problems(rows: Sequence[Row]) -> str:
+    counts = {len(_of(solver, rows)) for solver in PLANS} - {0}
+    return f"{min(counts, default=0)} to {max(counts, default=0)} problems a solver"
+
+
+def _mean(solver: str, rows: Sequence[Row]) -> Row:
+    own = _of(solver, rows)
+    return {name: sum(row[name] for row in own) / len(own) for name, _ in _COLUMNS.values()}
+
+
+def _markdown(titles: tuple[str, str], rows: Sequence[tuple[str, str, Row]]) -> str:
+    lines = [f"| {' | '.join((*titles, *_COLUMNS))} |", "|" + " --- |" * (2 + len(_COLUMNS))]
+    for first, second, row in rows:
+        cells = [layout.format(row[name]) for name, layout in _COLUMNS.values()]
+        lines.append(f"| {first} | {second} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
 
 
 @torch.no_grad()
-def run(pipeline: ControlMM, data: Path, clips: int, solvers: list[str], only: str | None) -> None:
-    """Print the table."""
-    chosen = [c for c in MotionFolder(data).clips("test") if len(c.features) >= FRAMES][:clips]
-    targets = torch.cat([recover_joints(c.features[None, :FRAMES], joints=22) for c in chosen])
-    text = torch.cat([pipeline.text_encoder.encode([c.captions[0].text]).pooled for c in chosen])
-    plan = Preset(EditingBudget(latent_iterations=0))
-    for problem in problems(len(chosen)):
-        if only is not None and only != problem.name:
-            continue
-        mask = drawn(problem, targets)
-        start = pipeline.generate_latents(
-            text,
-            lengths=[FRAMES] * len(chosen),
-            targets=targets,
-            mask=mask,
-            seeds=clip_seeds(0, len(chosen)),
-            preset=plan,
-        )
-        before = 100 * control_error(pipeline.decoder(start), targets, mask).median().item()
-        print(f"\n{problem.name}, {problem.keys} frames, before editing {before:.1f} cm", flush=True)
-        for solver in solvers:
-            found = row(pipeline, solver, start, targets, mask)
-            print(
-                f"{solver:>18}  " + "  ".join(f"{name} {value:8.3f}" for name, value in found.items()),
-                flush=True,
-            )
+def run(arguments: argparse.Namespace) -> None:
+    """Measure what is not measured yet; write ``rows.jsonl``, ``editing.json`` and ``editing.md``."""
+    pipeline = ControlMM.from_pretrained(arguments.model)
+    test_set = read_test_set(arguments.data, split=arguments.split)
+    protocol = Protocol(limit=arguments.limit, seed=arguments.seed)
+    about = {
+        "split": arguments.split, "data": test_set.sha256, "protocol": asdict(protocol),
+        "networks": {name: weights_sha256(network) for name, network in pipeline.networks().items()},
+    }  # fmt: skip
+    out: Path = arguments.out
+    _claim(out, about)
+    bench = Bench(pipeline, load_evaluator(arguments.evaluator), test_set, protocol)
+    file = out / "rows.jsonl"
+
+    def measure(key: str) -> Row:
+        solver, control, density = key.split("/")
+        row = bench.row(solver, ControlSetting(control, int(density)))
+        (out / "editing.md").write_text(table([*known_rows(file).values(), {"key": key, **row}]))
+        return row
+
+    rows = measured_rows(file, keys_of(arguments.solvers, arguments.controls, arguments.densities), measure)
+    (out / "editing.md").write_text(table(rows))
+    (out / "editing.json").write_text(json.dumps({**about, "rows": rows}, indent=2) + "\n")
+    print(table(rows))
+
+
+def _claim(out: Path, about: dict[str, object]) -> None:
+    """Rows of other weights or clips must not end up in one table."""
+    out.mkdir(parents=True, exist_ok=True)
+    file, text = out / "about.json", json.dumps(about, indent=2, sort_keys=True) + "\n"
+    if file.is_file() and file.read_text() != text:
+        raise SystemExit(f"{out} holds rows of another model, split, limit or seed. Choose another `--out`.")
+    file.write_text(text)
 
 
 def main() -> None:
@@ -134,18 +140,24 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--data", type=Path, help="HumanML3D-style folder")
+    parser.add_argument("--split", default="test")
+    parser.add_argument(
+        "--limit", type=int, default=32, help="clips a row; FID means little below a few hundred"
+    )
+    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--model", type=Path, help="model folder; by default the one that ships")
-    parser.add_argument("--clips", type=int, default=8)
-    parser.add_argument("--solvers", nargs="*", default=list(BUDGETS), choices=list(BUDGETS))
-    parser.add_argument("--only", help="one problem, such as pelvis or 'subsets of six'")
+    parser.add_argument("--evaluator", type=Path, help="evaluator folder; by default the one that ships")
+    parser.add_argument("--solvers", nargs="*", default=list(PLANS), choices=list(PLANS))
+    parser.add_argument("--controls", nargs="*", default=list(CONTROLS), choices=list(CONTROLS))
+    parser.add_argument("--densities", nargs="*", type=int, default=list(DENSITIES), choices=list(DENSITIES))
+    parser.add_argument("--out", type=Path, default=Path("out/editing"))
     parser.add_argument("--evaluation", action="store_true", help="milliseconds of one evaluation by part")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     if arguments.evaluation:
         print_evaluations()
     if arguments.data:
-        pipeline = ControlMM.from_pretrained(arguments.model)
-        run(pipeline, arguments.data, arguments.clips, arguments.solvers, arguments.only)
+        run(arguments)
 
 
 if __name__ == "__main__":

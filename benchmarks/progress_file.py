@@ -21,7 +21,7 @@ def measured_rows(path: Path, keys: Iterable[str], measure: Callable[[str], Row]
         measure: Makes the row of a key.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    rows = _known(path)
+    rows = known_rows(path)
     with path.open("a") as file:
         for key in tqdm(list(keys), desc=path.parent.name, unit="row"):
             if key in rows:
@@ -32,12 +32,13 @@ def measured_rows(path: Path, keys: Iterable[str], measure: Callable[[str], Row]
     return [rows[key] for key in keys]
 
 
-def _known(path: Path) -> dict[str, Row]:
+def known_rows(path: Path) -> dict[str, Row]:
+    """The rows of a file by their keys; the line that a kill cut off is none."""
     rows: dict[str, Row] = {}
     for line in path.read_text().splitlines() if path.is_file() else ():
         try:
             row = json.loads(line)
-        except json.JSONDecodeError:  # the line that a kill cut off
+        except json.JSONDecodeError:
             continue
         rows[row["key"]] = row
     return rows

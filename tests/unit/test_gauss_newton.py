@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from controlmm.generation.code_spread import CodeSpread
 from controlmm.generation.control_residuals import ControlResiduals
 from controlmm.generation.frozen_decoder import FrozenDecoder
 from controlmm.generation.kinematic_rows import kinematic_rows
@@ -197,7 +198,9 @@ def test_sensitivity_of_a_linear_decoder_is_its_jacobians_product():
     """Rectifiers that are always on make all rows shifted copies; away from the ends nothing is cut off."""
     decoder = FrozenDecoder(make_decoder(depth=1, is_always_on=True))
     channels, tokens = (0, 3, 4), 13
-    measured = measure_sensitivity(decoder, random(2, 25, 8), channels, downsample=4)
+    measured = measure_sensitivity(
+        decoder, random(2, 25, 8), channels, downsample=4, spread=CodeSpread(torch.eye(8))
+    )
     assert measured.scatter.max() < 1e-4 * measured.mean.square().sum((2, 3)).max()
     _, tape = decoder.forward(random(1, tokens, 8), channels)
     count = len(channels) * 4 * tokens

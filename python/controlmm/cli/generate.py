@@ -58,6 +58,13 @@ def generate(
     preset: Annotated[
         str, typer.Option(help="fast, balanced or accurate; with paper- in front as in the papers.")
     ] = "balanced",
+    naturalness: Annotated[
+        float | None,
+        typer.Option(
+            help="How strongly editing keeps feet, floor and uncontrolled joints as they were; 0 not at all.",
+            show_default=False,
+        ),
+    ] = None,
     samples: Annotated[int, typer.Option(help="Number of motions.")] = 1,
     vary: Annotated[
         str | None,
@@ -101,7 +108,7 @@ def generate(
         raise ValueError("A timeline has prompts of its own. Leave the prompt out.")
     prompt = entries[0].prompt if entries else _chosen_prompt(prompt, document)
     options: dict[str, Any] = {
-        "samples": samples, "preset": preset, "guidance_scale": guidance, "seed": seed
+        "samples": samples, "seed": seed
     }  # fmt: skip
     held = document.controls if document else ()
     source = Motion.load(edit) if edit else None
@@ -117,7 +124,8 @@ def generate(
         raise ValueError("`--vary` needs a TLControl model, for example: --model tlcontrol.")
     parts: dict[str, Any] = {} if vary is None else {"vary": vary}
     with PhaseBars(enabled=not quiet) as bars:
-        options |= {"progress": bars, **parts}
+        plan = pipeline.limited(pipeline.resolve_preset(preset, guidance), None, None, naturalness)
+        options |= {"progress": bars, "preset": plan, **parts}
         if entries:
             result = pipeline.timeline(entries, controls=held, obstacles=avoided, **options)
         elif source is not None:

@@ -9,8 +9,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from controlmm.generation.code_spread import CodeSpread
 from controlmm.generation.kinematic_rows import KinematicRows, kinematic_rows
 from controlmm.generation.motion_decoder import MotionDecoder
+from controlmm.generation.naturalness import Naturalness
 from controlmm.generation.partial_decoder import PartialDecoder, controlled_joints
 from controlmm.ops import recover_joints
 
@@ -25,6 +27,7 @@ class Probe:
         joints: (T, J, 3) what they decode to, metres.
         mask: (T, J, 3) the controlled coordinates.
         std: (D,) of the channels.
+        strain: Terms of naturalness, see :class:`Naturalness`.
     """
 
     residual: Float[Tensor, "N"]
@@ -32,6 +35,7 @@ class Probe:
     joints: Float[Tensor, "T J 3"]
     mask: Bool[Tensor, "T J 3"]
     std: Float[Tensor, "D"]
+    strain: float = 0.0
 
     @property
     def loss(self) -> float:
@@ -51,10 +55,11 @@ class ControlResiduals:
         targets: (B, T, J, 3) metres.
         mask: (B, T, J, 3), the controlled coordinates.
         frames: (B, T), the frames of each clip.
-        joints: Which joints are decoded; by default those that some clip controls.
+        joints: Which joints the metric knows; by default those that some clip controls.
         prefix: Latents of motions whose first ``prefix_frames`` frames are kept whatever is tried: features
             there count as constant, although tokens behind them would change them a little.
         prefix_frames: See ``prefix``.
+        naturalness: What is kept small beside the residual; all joints are decoded for it.
     """
 
     def __init__(
@@ -67,9 +72,14 @@ class ControlResiduals:
         joints: Sequence[int] | None = None,
         prefix: Float[Tensor, "B L C"] | None = None,
         prefix_frames: int = 0,
+        naturalness: Naturalness | None = None,
     ) -> None:
         self.decoder, self._targets, self._mask, self._frames = decoder, targets, mask, frames
-        self.part = PartialDecoder(decoder, joints or controlled_joints(mask), frames)
+        self.naturalness = naturalness
+        self.led = tuple(joints or controlled_joints(mask))
+        self.channels = (0, 1, 2, 3, *(1 + 3 * j + axis for j in self.led[1:] for axis in range(3)))
+        decoded = self.led if naturalness is None else tuple(range(mask.shape[2]))
+        self.part = PartialDecoder(decoder, decoded, frames)
         wanted = list(self.part.joints)
         self._wanted, self._controlled = targets[:, :, wanted], mask[:, :, wanted]
         self._lengths: list[int] = frames.sum(1).tolist()
@@ -85,9 +95,10 @@ class ControlResiduals:
             self._targets[clips],
             self._mask[clips],
             self._frames[clips],
-            joints=self.part.joints,
+            joints=self.led,
             prefix=None if self._prefix is None else self._prefix[clips],
             prefix_frames=0 if self._held is None else self._held.shape[1],
+            naturalness=None if self.naturalness is None else self.naturalness.select(clips),
         )
 
     @torch.enable_grad()
@@ -101,27 +112,56 @@ class ControlResiduals:
             features = torch.cat([self._held, features[:, self._held.shape[1] :]], dim=1)
         features = features * part.std + part.mean
         self._joints = recover_joints(features, joints=len(part.joints))
+        self._strains: Tensor | None = None
+        strains = [0.0] * len(latents)
+        if self.naturalness is not None:
+            self._strains = self.naturalness.values(features, self._joints)
+            strains = self._strains.tolist()
         joints, difference = self._joints.detach(), self._joints.detach() - self._wanted
+        features, std, controlled = features.detach(), part.std, self._controlled
+        if self.naturalness is not None:  # the metric looks at joints with targets only
+            led, channels = list(self.led), list(self.channels)
+            joints, controlled = joints[:, :, led], controlled[:, :, led]
+            features, std = features[..., channels], std[channels]
         return [
             Probe(
-                difference[clip][mask].double(),
-                features[clip, :length].detach(),
+                difference[clip][self._controlled[clip]].double(),
+                features[clip, :length],
                 joints[clip, :length],
                 mask[:length],
-                part.std,
+                std,
+                strains[clip],
             )
-            for clip, (mask, length) in enumerate(zip(self._controlled, self._lengths, strict=True))
+            for clip, (mask, length) in enumerate(zip(controlled, self._lengths, strict=True))
         ]
+
+    @property
+    def spread(self) -> CodeSpread:
+        """The unit of the latents' steps."""
+        return self.decoder.spread()
 
     def channel_gram(self, frames: int) -> Float[Tensor, "D T D T"]:
         """Products of the decoder's rows for clips of ``frames`` frames, on average."""
-        return self.decoder.channel_gram(self.part.channels, frames // self.decoder.downsample)
+        return self.decoder.channel_gram(self.channels, frames // self.decoder.downsample)
 
-    def pull(self, weights: Sequence[Float[Tensor, "N"] | None]) -> Float[Tensor, "B L C"]:
-        """Gradients of ``weights . residual`` at the latest probe; zero for clips without weights."""
+    def pull(
+        self, weights: Sequence[Float[Tensor, "N"] | None], *, strained: Sequence[bool] = ()
+    ) -> Float[Tensor, "B L C"]:
+        """Gradients at the latest probe of ``weights . residual``, plus the strain of ``strained`` clips.
+
+        Zero for clips without weights.
+        """
         gradient = torch.zeros_like(self._joints)
         for clip, wanted in enumerate(weights):
             if wanted is not None:
                 gradient[clip][self._controlled[clip]] = wanted.float()
-        (features,) = torch.autograd.grad(self._joints, self._features, gradient, retain_graph=True)
+        outputs, slopes = [self._joints], [gradient]
+        if self._strains is not None and any(strained):
+            outputs.append(self._strains)
+            counts = [
+                is_strained and wanted is not None
+                for is_strained, wanted in zip(strained, weights, strict=True)
+            ]
+            slopes.append(torch.tensor(counts, dtype=torch.float32))
+        (features,) = torch.autograd.grad(outputs, self._features, slopes, retain_graph=True)
         return self.part.pull(self._decoded, features)

@@ -33,6 +33,8 @@ class EditingBudget:
             chooses between them, need no rates.
         tolerance: Metres. A clip is done when it is this near its targets.
         time_budget: Seconds for the latents of a batch. Results then depend on the speed of the machine.
+        naturalness: Strength of the terms that keep latent editing natural, see ``generation.naturalness``;
+            0 leaves them out, 1 is what was chosen on validation clips.
     """
 
     logits_iterations: int = 0  # in each decoding step
@@ -46,6 +48,7 @@ class EditingBudget:
     solver: LatentSolver = "papers"  # of latents
     tolerance: float | None = None
     time_budget: float | None = None
+    naturalness: float = 0.0
 
     def __post_init__(self) -> None:
         if self.logits_iterations < 0 or self.latent_iterations < 0:
@@ -58,6 +61,8 @@ class EditingBudget:
 
         if self.solver not in get_args(LatentSolver):
             raise ValueError(f"`solver` must be one of {get_args(LatentSolver)}, got {self.solver!r}.")
+        if not (math.isfinite(self.naturalness) and self.naturalness >= 0):
+            raise ValueError(f"`naturalness` must be a number of at least 0, got {self.naturalness!r}.")
         for name in ("tolerance", "time_budget"):
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0):

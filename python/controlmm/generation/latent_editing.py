@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from controlmm.generation.editing import EditingBudget
+from controlmm.generation.naturalness import NaturalWeights
 from controlmm.generation.objective import ControlObjective
 from controlmm.generation.solvers import (
     Progress,
@@ -20,6 +21,7 @@ from controlmm.generation.solvers import (
 )
 
 _LBFGS_STEPS = 4  # for each step of Gauss-Newton, which costs as much and looks further ahead
+_NATURAL_SHARE = 0.4  # of the steps of L-BFGS
 _PER_METRE = {"m": 1.0, "mm": 1000.0}  # of a skeleton's unit
 
 
@@ -38,9 +40,13 @@ def edit_latents(
         latents: Where to start.
         keep: 1 where a token may change, 0 in padding and where it is held fixed.
         budget: Solver and limits. ``auto`` takes Gauss-Newton for squared distances to targets and L-BFGS for
-            everything else, with four steps where Gauss-Newton would take one.
+            everything else, with four steps where Gauss-Newton would take one. With ``naturalness``, the
+            motion of ``latents`` is what editing is compared with.
         progress: Called after every evaluation.
     """
+    plain = objective
+    if budget.naturalness:
+        objective = objective.kept_natural(latents, NaturalWeights().times(budget.naturalness))
     unit = _PER_METRE[objective.decoder.normalizer.skeleton.unit]
     stopping = Stopping(
         error=None if budget.tolerance is None else budget.tolerance * unit,
@@ -62,5 +68,29 @@ def edit_latents(
     if budget.solver == "auto" and residuals is None:
         stopping = replace(stopping, iterations=_LBFGS_STEPS * budget.latent_iterations)
     if budget.solver == "lbfgs" or residuals is None:
-        return lbfgs(objective, latents, keep, stopping, progress=progress)
+        return _lbfgs(objective, plain, latents, keep, stopping, progress)
     return gauss_newton(residuals, latents, keep, stopping, progress=progress)
+
+
+def _lbfgs(
+    natural: ControlObjective,
+    plain: ControlObjective,
+    latents: Float[Tensor, "B L C"],
+    keep: Float[Tensor, "B L 1"],
+    stopping: Stopping,
+    progress: Progress | None,
+) -> Solution:
+    """The first part of the way is natural; what is then left of the error goes the shortest way."""
+    if natural is plain or stopping.iterations is None:
+        return lbfgs(natural, latents, keep, stopping, progress=progress)
+    steps = round(_NATURAL_SHARE * stopping.iterations)
+    first = lbfgs(natural, latents, keep, replace(stopping, iterations=steps), progress=progress)
+    spent = 1000 * first.seconds
+    if stopping.milliseconds is not None and spent >= stopping.milliseconds:
+        return first
+    left = replace(
+        stopping,
+        iterations=stopping.iterations - steps,
+        milliseconds=None if stopping.milliseconds is None else stopping.milliseconds - spent,
+    )
+    return first.then(lbfgs(plain, first.latents, keep, left, progress=progress))

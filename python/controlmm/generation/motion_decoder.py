@@ -6,10 +6,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from controlmm.generation.code_spread import CodeSpread
 from controlmm.generation.frozen_decoder import FrozenDecoder
 from controlmm.generation.sensitivity import WINDOW, Sensitivity, measure_sensitivity
 from controlmm.models.tokenizer import MotionTokenizer
 from controlmm.motion.normalizer import Normalizer
+from controlmm.nn.quantizer import ResidualQuantizer
 from controlmm.ops import recover_joints
 
 _SEQUENCES, _SEED = 6, 1  # of random codes
@@ -29,6 +31,7 @@ class MotionDecoder(nn.Module):
         self.normalizer = normalizer
         self._packed_version: tuple[int, ...] = ()
         self._frozen: dict[torch.dtype, FrozenDecoder] = {}
+        self._spread: tuple[tuple[int, ...], CodeSpread] | None = None
         self._sensitivities: dict[tuple[int, ...], Sensitivity] = {}
         self._grams: dict[tuple[tuple[int, ...], int], Tensor] = {}
 
@@ -46,20 +49,32 @@ class MotionDecoder(nn.Module):
         return self._frozen[dtype]
 
     def channel_gram(self, channels: tuple[int, ...], tokens: int) -> Float[Tensor, "D T D T"]:
-        """Products of the rows of the decoder's Jacobian, on average over random codes; see ``sensitivity``.
+        """Products of the rows of the decoder's Jacobian, in the unit of :meth:`spread`; see ``sensitivity``.
 
         Made at the first call for some channels (a fraction of a second), remembered for a few lengths.
         """
-        frozen = self.frozen()
+        frozen, spread = self.frozen(), self.spread()
         if channels not in self._sensitivities:
             self._sensitivities[channels] = measure_sensitivity(
-                frozen, self.typical_latents(), channels, downsample=self.downsample
+                frozen, self.typical_latents(), channels, downsample=self.downsample, spread=spread
             )
         if (channels, tokens) not in self._grams:
             while len(self._grams) >= _REMEMBERED:
                 self._grams.pop(next(iter(self._grams)))
             self._grams[channels, tokens] = self._sensitivities[channels].gram(tokens)
         return self._grams[channels, tokens]
+
+    def spread(self) -> CodeSpread:
+        """The unit of steps in latent space, of a residual tokenizer."""
+        quantizer = self.tokenizer.quantizer
+        assert isinstance(quantizer, ResidualQuantizer)  # only its sums of codes have one spread
+        books = [quantizer.book(layer).codes for layer in range(self.tokenizer.config.num_quantizers)]
+        version = tuple(x for codes in books for x in (codes.data_ptr(), codes._version))
+        if self._spread is None or self._spread[0] != version:
+            self._spread = version, CodeSpread.of_codebooks(books)
+            self._sensitivities.clear()
+            self._grams.clear()
+        return self._spread[1]
 
     def typical_latents(self) -> Float[Tensor, "S W C"]:
         """A few sequences of random codes, always the same."""

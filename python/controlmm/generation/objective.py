@@ -11,11 +11,14 @@ from torch import Tensor
 
 from controlmm.generation.control_residuals import ControlResiduals
 from controlmm.generation.motion_decoder import MotionDecoder
+from controlmm.generation.naturalness import Naturalness, NaturalWeights
 from controlmm.generation.partial_decoder import PartialDecoder, controlled_joints
 from controlmm.generation.terms import JointTerm
 from controlmm.models.rvq_vae import RvqVae
 from controlmm.ops import frames_last, guidance_value_and_grad, masked_consistency_loss, recover_joints
 from controlmm.ops.consistency import Norm
+
+STRAIN_WEIGHT = 1e-4  # m^2 of squared error for each unit of naturalness lost
 
 
 class Objective(Protocol):
@@ -48,6 +51,7 @@ class ControlObjective:
         frames: (B, T), the frames of each clip.
         norm: As in :func:`controlmm.ops.masked_consistency_loss`; the paper's words are "l2".
         terms: What is added to the error, such as obstacles.
+        naturalness: What is weighed against the error.
     """
 
     def __init__(
@@ -59,10 +63,11 @@ class ControlObjective:
         *,
         norm: Norm = "mse",
         terms: Sequence[JointTerm] = (),
+        naturalness: Naturalness | None = None,
     ) -> None:
         self.targets, self.mask = targets, mask
         self.decoder, self.frames, self.norm = decoder, frames, norm
-        self.terms = tuple(terms)
+        self.terms, self.naturalness = tuple(terms), naturalness
         self._part = PartialDecoder(decoder, self._joints(), frames)
         joints = list(self._part.joints)
         self._wanted = frames_last(targets[:, :, joints]), frames_last(mask[:, :, joints])
@@ -83,11 +88,12 @@ class ControlObjective:
             norm=self.norm,
             out=self._gradient,
         )
-        if self.terms:
-            values, slope = self._terms_and_gradient(decoded.features)
-            self._loss = self._loss + values
-            self._gradient += slope.mT
-        return self._loss, part.pull(decoded, self._gradient.mT)
+        if not self.terms and self.naturalness is None:
+            return self._loss, part.pull(decoded, self._gradient.mT)
+        values, strain, slope = self._terms_and_gradient(decoded.features)
+        self._loss = self._loss + values
+        self._gradient += slope.mT
+        return self._loss + strain, part.pull(decoded, self._gradient.mT)
 
     def select(self, clips: Int[Tensor, "S"]) -> ControlObjective:
         """See :class:`Objective`."""
@@ -98,20 +104,36 @@ class ControlObjective:
             self.frames[clips],
             norm=self.norm,
             terms=[term.select(clips) for term in self.terms],
+            naturalness=None if self.naturalness is None else self.naturalness.select(clips),
+        )
+
+    def kept_natural(self, latents: Float[Tensor, "B L C"], weights: NaturalWeights) -> ControlObjective:
+        """The same with the terms of naturalness for editing that starts from ``latents``."""
+        naturalness = Naturalness.of_start(self.decoder, latents, self.mask, self.frames, weights)
+        return ControlObjective(
+            self.decoder,
+            self.targets,
+            self.mask,
+            self.frames,
+            norm=self.norm,
+            terms=self.terms,
+            naturalness=naturalness,
         )
 
     def residuals(self) -> ControlResiduals | None:
         """The same as a sum of squares, for Gauss-Newton; ``None`` if it is none that Gauss-Newton knows."""
         if self.terms or self.norm != "mse" or not isinstance(self.decoder.tokenizer, RvqVae):
             return None
-        return ControlResiduals(self.decoder, self.targets, self.mask, self.frames)
+        return ControlResiduals(
+            self.decoder, self.targets, self.mask, self.frames, naturalness=self.naturalness
+        )
 
     def errors(self) -> Float[Tensor, "B"]:
         """At least the mean distance of the controlled points in metres, at the latest evaluation.
 
         By the mean square it is the root mean square distance; points with a free axis count as if their
         distance were larger by at most the square root of 3. Terms count as errors: a clip inside an obstacle
-        is not done.
+        is not done. Naturalness does not.
         """
         if self.norm == "l2":
             return self._loss
@@ -119,17 +141,25 @@ class ControlObjective:
 
     def _joints(self) -> tuple[int, ...]:
         """Terms see all joints, distances to targets only those that have some."""
-        return tuple(range(self.targets.shape[2])) if self.terms else controlled_joints(self.mask)
+        if self.terms or self.naturalness is not None:
+            return tuple(range(self.targets.shape[2]))
+        return controlled_joints(self.mask)
 
     @torch.enable_grad()
     def _terms_and_gradient(
         self, decoded: Float[Tensor, "B T D"]
-    ) -> tuple[Float[Tensor, "B"], Float[Tensor, "B T D"]]:
+    ) -> tuple[Float[Tensor, "B"], Float[Tensor, "B"], Float[Tensor, "B T D"]]:
+        """Terms, weighed naturalness, and the gradient of both."""
         decoded = decoded.requires_grad_()
-        joints = recover_joints(decoded * self._part.std + self._part.mean, joints=len(self._part.joints))
-        values = torch.stack([term.values(joints) for term in self.terms]).sum(0)
-        (slope,) = torch.autograd.grad(values.sum(), decoded)
-        return values.detach(), slope
+        features = decoded * self._part.std + self._part.mean
+        joints = recover_joints(features, joints=len(self._part.joints))
+        nothing = joints.new_zeros(len(joints))
+        values = sum((term.values(joints) for term in self.terms), nothing)
+        strain = nothing
+        if self.naturalness is not None:
+            strain = STRAIN_WEIGHT * self.naturalness.values(features, joints)
+        (slope,) = torch.autograd.grad((values + strain).sum(), decoded)
+        return values.detach(), strain.detach(), slope
 
 
 def control_error(

@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from controlmm.generation.code_spread import CodeSpread
 from controlmm.generation.frozen_decoder import FrozenDecoder
 
 WINDOW = 25  # tokens of a sequence; of a channel's answer, less than 2 % comes from farther away than 12
@@ -26,8 +27,8 @@ class Sensitivity:
     """Answers of ``D`` channels in the ``S`` frames of one token.
 
     Attributes:
-        mean: (D, S, W, C), the mean rows of the Jacobian: change of a channel for a unit change of each
-            latent number of the W tokens around.
+        mean: (D, S, W, C), the mean rows of the Jacobian: change of a channel for a unit step in each
+            direction of the W tokens around.
         scatter: (D, S), the mean squared length of what single rows have beyond the mean.
     """
 
@@ -60,6 +61,7 @@ def measure_sensitivity(
     channels: Sequence[int],
     *,
     downsample: int,
+    spread: CodeSpread,
 ) -> Sensitivity:
     """Measure a decoder on some sequences.
 
@@ -68,6 +70,7 @@ def measure_sensitivity(
         latents: Sequences of W tokens like those that will be edited.
         channels: Which channels of the decoder's output.
         downsample: Frames for each token.
+        spread: The unit of the latents' steps.
     """
     sequences, window, width = latents.shape
     _, tape = decoder.forward(latents, channels)
@@ -77,7 +80,7 @@ def measure_sensitivity(
         seeds[row, middle + row % downsample, row // downsample] = 1
     total, power = torch.zeros(count, window, width), torch.zeros(count)
     for sequence in range(sequences):
-        rows = decoder.pull(tape.select(torch.full((count,), sequence)), seeds)
+        rows = spread.gradient(decoder.pull(tape.select(torch.full((count,), sequence)), seeds))
         total += rows
         power += rows.square().sum((1, 2))
     mean, shape = total / sequences, (len(channels), downsample)

@@ -199,9 +199,15 @@ class ControlMM(MotionPipeline[Preset]):
         """See :class:`MotionPipeline`."""
         return plan.is_exact
 
-    def limited(self, plan: Preset, tolerance: str | float | None, time_budget: str | float | None) -> Preset:
+    def limited(
+        self,
+        plan: Preset,
+        tolerance: str | float | None,
+        time_budget: str | float | None,
+        naturalness: float | None,
+    ) -> Preset:
         """See :class:`MotionPipeline`."""
-        return with_limits(plan, tolerance=tolerance, time_budget=time_budget)
+        return with_limits(plan, tolerance=tolerance, time_budget=time_budget, naturalness=naturalness)
 
     @property
     def longest(self) -> int:

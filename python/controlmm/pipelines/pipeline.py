@@ -145,6 +145,7 @@ class MotionPipeline(ABC, Generic[_Plan]):
         guidance_scale: float | None = None,
         tolerance: str | float | None = None,
         time_budget: str | float | None = None,
+        naturalness: float | None = None,
         seed: int = 0,
         progress: Progress | None = None,
     ) -> GenerationResult:
@@ -171,6 +172,9 @@ class MotionPipeline(ABC, Generic[_Plan]):
                 preset's.
             time_budget: Time for the editing of latents, in seconds or as ``"200ms"``. Results then depend on
                 the speed of the machine.
+            naturalness: How strongly editing keeps what no target leads as it was: 0 not at all, 1 as the
+                presets do (the papers' do not). Feet at rest stay, joints do not shake, and the ground stays
+                level where heights are free; 0 if a path climbs stairs.
             seed: Same seed, same motions.
             progress: Called as ``progress(phase, done, total)`` during long loops.
 
@@ -180,7 +184,8 @@ class MotionPipeline(ABC, Generic[_Plan]):
         """
         started = time.perf_counter()
         check_sampling(samples=samples, seed=seed)
-        plan = self.limited(self.resolve_preset(preset, guidance_scale), tolerance, time_budget)
+        plan = self.resolve_preset(preset, guidance_scale)
+        plan = self.limited(plan, tolerance, time_budget, naturalness)
         arrange = partial(
             Scene.of_call,
             prompt,
@@ -237,15 +242,22 @@ class MotionPipeline(ABC, Generic[_Plan]):
             )
         return plan
 
-    def limited(self, plan: _Plan, tolerance: str | float | None, time_budget: str | float | None) -> _Plan:
-        """``plan`` with other limits of editing.
+    def limited(
+        self,
+        plan: _Plan,
+        tolerance: str | float | None,
+        time_budget: str | float | None,
+        naturalness: float | None,
+    ) -> _Plan:
+        """``plan`` with other limits of editing and another strength of its natural terms.
 
         Raises:
             ValueError: If a limit is unusable, or this pipeline knows none.
         """
-        if tolerance is not None or time_budget is not None:
+        if not (tolerance is time_budget is naturalness is None):
             raise ValueError(
-                f"{type(self).__name__} knows no `tolerance` and no `time_budget`. Choose a preset instead."
+                f"{type(self).__name__} knows no `tolerance`, no `time_budget` and no `naturalness`. "
+                "Choose a preset instead."
             )
         return plan
 

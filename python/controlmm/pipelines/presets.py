@@ -40,12 +40,16 @@ class Preset:
                 raise ValueError(f"`{name}` must be a finite number, got {value!r}.")
 
 
+def _solved(iterations: int, tolerance: float) -> EditingBudget:
+    return EditingBudget(solver="auto", latent_iterations=iterations, tolerance=tolerance, naturalness=1.0)
+
+
 # `python -m benchmarks.editing` measures them. The papers' iteration counts are there to compare with.
 PRESETS = {
-    "fast": Preset(EditingBudget(solver="auto", latent_iterations=20, tolerance=0.01)),
-    "balanced": Preset(EditingBudget(solver="auto", latent_iterations=40, tolerance=0.003)),
-    "accurate": Preset(EditingBudget(solver="auto", latent_iterations=80, tolerance=0.001)),
-    "exact": Preset(EditingBudget(solver="auto", latent_iterations=80, tolerance=0.001), is_exact=True),
+    "fast": Preset(_solved(20, 0.01)),
+    "balanced": Preset(_solved(40, 0.003)),
+    "accurate": Preset(_solved(80, 0.001)),
+    "exact": Preset(_solved(80, 0.001), is_exact=True),
     "paper-fast": Preset(EditingBudget(latent_iterations=100)),
     "paper-medium": Preset(EditingBudget(latent_iterations=600)),
     "paper-accurate": Preset(EditingBudget(logits_iterations=100, latent_iterations=600)),
@@ -83,7 +87,11 @@ def preset_named(name: str) -> Preset:
 
 
 def with_limits(
-    plan: Preset, *, tolerance: str | float | None = None, time_budget: str | float | None = None
+    plan: Preset,
+    *,
+    tolerance: str | float | None = None,
+    time_budget: str | float | None = None,
+    naturalness: float | None = None,
 ) -> Preset:
     """``plan`` with other limits of latent editing; ``None`` leaves one as it is.
 
@@ -91,16 +99,27 @@ def with_limits(
         plan: A preset.
         tolerance: Control error at which a clip is done, in metres or with a unit: ``"1mm"``, ``"2 cm"``.
         time_budget: Time for the editing of latents, in seconds or with a unit: ``"200ms"``.
+        naturalness: Strength of the terms that keep editing natural; 0 leaves them out.
 
     Raises:
         ValueError: If a quantity is unusable.
     """
     budget = plan.budget
+    if naturalness is not None:
+        budget = replace(budget, naturalness=_strength(naturalness))
     if tolerance is not None:
         budget = replace(budget, tolerance=quantity("tolerance", tolerance, _LENGTHS))
     if time_budget is not None:
         budget = replace(budget, time_budget=quantity("time_budget", time_budget, _TIMES))
     return replace(plan, budget=budget)
+
+
+def _strength(value: float) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < math.inf:
+        raise ValueError(
+            f"`naturalness` must be a number of at least 0 (0 none, 1 the presets'), got {value!r}."
+        )
+    return float(value)
 
 
 def quantity(name: str, value: str | float, units: Mapping[str, float]) -> float:

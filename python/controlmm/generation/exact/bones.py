@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controlmm.generation.exact.projection import STIFFNESS, graph_laplacian
+from controlmm.generation.exact.smooth_bones import bone_slopes
 from controlmm.motion.skeleton import Skeleton
 
 _ITERATIONS = 20
@@ -61,28 +62,19 @@ def _restored(
     skeleton: Skeleton,
 ) -> Float[Tensor, "T J 3"]:
     """Newton's method on the constraints, each frame by itself."""
-    frames, count = joints.shape[:2]
+    count = joints.shape[1]
     start = moved = joints.double()
     resistance = torch.kron(STIFFNESS * graph_laplacian(skeleton) + torch.eye(count), torch.eye(3))
     stays = _PLANTED * planted
     stays[:, list(skeleton.foot_joints)] += _FEET  # else knees would keep their place and feet would slide
     extra = stays[..., None] + _HELD * held
     yielding = torch.linalg.inv(resistance + torch.diag_embed(extra.double().flatten(1)))  # (T, 3J, 3J)
-    children = torch.arange(1, count)
-    parents = torch.tensor(skeleton.parents[1:])
-    wanted = lengths.double()[1:]
     for _ in range(_ITERATIONS):
-        bones = moved[:, children] - moved[:, parents]
-        length = bones.norm(dim=-1)
-        if (length - wanted).abs().max() < _ENOUGH:
+        slopes, short = bone_slopes(moved, lengths, skeleton)
+        if short.abs().max() < _ENOUGH:
             break
-        direction = bones / length.clamp(min=1e-9)[..., None]
-        slopes = torch.zeros(frames, count - 1, count, 3, dtype=torch.float64)
-        slopes[:, children - 1, children] = direction
-        slopes[:, children - 1, parents] = -direction
-        slopes = slopes.flatten(2)
         answers = yielding @ slopes.mT  # (T, 3J, J - 1)
         matrix = slopes @ answers + _SLACK * torch.eye(count - 1)
-        forces = torch.linalg.solve(matrix, (wanted - length)[..., None])
+        forces = torch.linalg.solve(matrix, short[..., None])
         moved = moved + (answers @ forces).unflatten(1, (count, 3))[..., 0]
     return torch.where(held, start, moved)

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from controlmm.generation.code_spread import CodeSpread
 from controlmm.generation.objective import Measured, Objective
 from controlmm.generation.solvers.stopping import Reason, Solution, Stopping, Watch
 
@@ -31,11 +32,18 @@ Search = Generator[Float[Tensor, "N"], Sample, Reason]
 
 
 class ClipRecord:
-    """One clip on its way: its unknowns (the latents of the tokens that may change) and its best iterate."""
+    """One clip on its way: its unknowns and its best iterate.
 
-    def __init__(self, latents: Float[Tensor, "L C"], keep: Float[Tensor, "L 1"]) -> None:
-        self.is_free = keep[:, 0] > 0
+    Unknown are the latents of the tokens that may change or, given a ``spread``, their changes in its unit.
+    """
+
+    def __init__(
+        self, latents: Float[Tensor, "L C"], keep: Float[Tensor, "L 1"], spread: CodeSpread | None = None
+    ) -> None:
+        self.is_free, self._spread = keep[:, 0] > 0, spread
         self.start: Tensor = latents[self.is_free].flatten()
+        if spread is not None:
+            self.start = torch.zeros_like(self.start)
         self._best, self._best_loss = self.start, math.inf
         self.losses: list[float] = []
         self.errors: list[float] = []
@@ -51,9 +59,16 @@ class ClipRecord:
 
     def placed(self, point: Tensor, latents: Float[Tensor, "L C"]) -> Float[Tensor, "L C"]:
         """``latents`` with the unknowns replaced by ``point``."""
-        placed = latents.clone()
-        placed[self.is_free] = point.unflatten(0, (-1, latents.shape[-1]))
+        placed, rows = latents.clone(), point.unflatten(0, (-1, latents.shape[-1]))
+        placed[self.is_free] = (
+            rows if self._spread is None else latents[self.is_free] + self._spread.change(rows)
+        )
         return placed
+
+    def gradient(self, gradient: Float[Tensor, "L C"]) -> Float[Tensor, "N"]:
+        """The gradient in the unknowns, given that in the latents."""
+        rows = gradient[self.is_free]
+        return (rows if self._spread is None else self._spread.gradient(rows)).flatten()
 
     def best_in(self, latents: Float[Tensor, "L C"]) -> Float[Tensor, "L C"]:
         """``latents`` with the best iterate in its place."""
@@ -67,11 +82,12 @@ def run_searches(
     keep: Float[Tensor, "B L 1"],
     stopping: Stopping,
     *,
+    spread: CodeSpread | None = None,
     progress: Progress | None = None,
 ) -> Solution:
     """Drive ``search`` from the latents of every clip until each of them stops."""
     latents = latents.detach()
-    records = [ClipRecord(clip, kept) for clip, kept in zip(latents, keep, strict=True)]
+    records = [ClipRecord(clip, kept, spread) for clip, kept in zip(latents, keep, strict=True)]
     watch = Watch(stopping)
     searches = {row: search(record.start) for row, record in enumerate(records)}
     points = {row: next(running) for row, running in searches.items()}
@@ -89,7 +105,7 @@ def run_searches(
             record.reason = watch.verdict(loss=loss, error=error, evaluations=len(record.losses))
             if record.reason is None:
                 try:
-                    sample = Sample(loss, gradient[record.is_free].flatten())
+                    sample = Sample(loss, record.gradient(gradient))
                     points[row] = searches[row].send(sample)
                 except StopIteration as stop:
                     record.reason = stop.value

@@ -5,6 +5,7 @@ nearest to what the networks made. Its matrix is not built from the decoder's Ja
 backward pass for every controlled coordinate, but from what the decoder's Jacobian is on average (see
 ``sensitivity``) and the exact Jacobian of the kinematics. So a step is one pass forward and one back. What
 the average leaves is learned along the way, as by L-BFGS, in the metric that makes all residuals alike.
+Lengths of steps are measured in standard deviations of the codes (``code_spread``).
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from controlmm.generation.control_residuals import ControlResiduals, Probe
 from controlmm.generation.solvers.clip_search import ClipRecord, Progress, report, solution_of
 from controlmm.generation.solvers.curvature import Curvature
 from controlmm.generation.solvers.metric import Metric
+from controlmm.generation.solvers.natural_way import STEPS, NaturalWay
 from controlmm.generation.solvers.stopping import Reason, Solution, Stopping, Watch
 
 _EARLY_RENEWALS, _STEPS_OF_A_METRIC = (2, 5), 10  # steps after which a metric is made anew
@@ -46,7 +48,7 @@ def gauss_newton(
         progress: Called after every evaluation.
     """
     latents = latents.detach()
-    records = [ClipRecord(clip, kept) for clip, kept in zip(latents, keep, strict=True)]
+    records = [ClipRecord(clip, kept, residuals.spread) for clip, kept in zip(latents, keep, strict=True)]
     descents = [_Descent(record.start, residuals, stopping.iterations) for record in records]
     watch = Watch(stopping)
     selected, active = residuals, list(range(len(records)))
@@ -60,10 +62,10 @@ def gauss_newton(
             record.reason = watch.verdict(loss=probe.loss, error=error, evaluations=len(record.losses))
             wanted.append(descent.see(probe) if record.reason is None else None)
         if any(weights is not None for weights in wanted):
-            gradients = selected.pull(wanted)
+            gradients = selected.pull(wanted, strained=[descents[row].is_natural for row in active])
             for row, weights, gradient in zip(active, wanted, gradients, strict=True):
                 if weights is not None:
-                    descents[row].turn(gradient[records[row].is_free].flatten())
+                    descents[row].turn(records[row].gradient(gradient))
         for row in active:
             records[row].reason = records[row].reason or descents[row].reason
         still = [row for row in active if records[row].reason is None]
@@ -88,25 +90,54 @@ class _Descent:
         self._value, self._slope = math.inf, 0.0
         self._gradient: Tensor | None = None
         self._halvings = 0
+        self._push = 0.0  # squared length of the step that the residual alone asks for
+        natural, steps = residuals.naturalness, STEPS if iterations is None else min(STEPS, iterations // 2)
+        self._natural: NaturalWay | None = None
+        if natural is not None:
+            self._natural = NaturalWay(start, nearness=natural.weights.nearness, steps=steps)
+
+    @property
+    def is_natural(self) -> bool:
+        """Whether the strain of the motion counts."""
+        return self._natural is not None
 
     def see(self, probe: Probe) -> Float[Tensor, "N"] | None:
         """Weights of the gradient wanted here; ``None`` if the point is refused for a nearer one."""
         if self._metric is None:
             self._renew(probe)
         assert self._metric is not None
-        value, weights = self._metric.weigh(probe.residual)
+        value, weights = self._weigh(probe)
         if not value <= self._value + _SUFFICIENT_DECREASE * self._step * self._slope:
             self._shorten(value)
             return None
         self._done += 1
         if self._done in _EARLY_RENEWALS or (self._done and self._done % _STEPS_OF_A_METRIC == 0):
             self._renew(probe)
-            value, weights = self._metric.weigh(probe.residual)
+            value, weights = self._weigh(probe)
+        if self._natural is not None and self._natural.ends(self._done):
+            self._go_straight()
+            value, weights = self._weigh(probe)
+        elif self._natural is not None and self._natural.shift(probe.residual):
+            value, weights = self._weigh(probe)
+            self._gradient = None
         self._value = value
+        if self._natural is not None:
+            self._push = 2 * self._metric.weigh(probe.residual)[0]
         return weights
+
+    def _weigh(self, probe: Probe) -> tuple[float, Float[Tensor, "N"]]:
+        """What is minimised, and the weights of the residual in its gradient."""
+        assert self._metric is not None
+        if self._natural is None:
+            return self._metric.weigh(probe.residual)
+        value, weights = self._metric.weigh(self._natural.shifted(probe.residual))
+        return value + self._natural.value(probe, self.point), weights
 
     def turn(self, gradient: Float[Tensor, "N"]) -> None:
         """Choose where to go from the latest point."""
+        if self._natural is not None:
+            gradient = gradient + self._natural.slope(self.point)
+            self._natural.see(gradient, self._push)
         if self._gradient is not None:
             self._memory.add(self.point - self._origin, gradient - self._gradient)
         if self._iterations is not None and self._done >= self._iterations:
@@ -116,10 +147,23 @@ class _Descent:
         self._direction = self._memory.direction(gradient)
         self._slope = (gradient @ self._direction).item()
         if self._slope >= -_FLAT * self._value:
-            self.reason = "converged"
+            self._end()
             return
         self._step, self._halvings = 1.0, 0
         self.point = self._origin + self._direction
+
+    def _end(self) -> None:
+        """No step is left; after the natural part, the shortest way may still have some."""
+        if self._natural is None:
+            self.reason = "converged"
+            return
+        self._go_straight()
+        self._value, self.point = math.inf, self._origin
+
+    def _go_straight(self) -> None:
+        """From here on targets alone count."""
+        self._natural, self._gradient = None, None
+        self._memory.clear()
 
     def _renew(self, probe: Probe) -> None:
         """The metric of the clip as it now is; gradients of the old one cannot be compared with new ones."""
@@ -131,7 +175,7 @@ class _Descent:
         """Go back towards the origin, to the minimum of the parabola through what is known of the line."""
         self._halvings += 1
         if self._halvings > _MOST_HALVINGS:
-            self.reason = "converged"
+            self._end()
             return
         excess = value - self._value - self._slope * self._step
         best = -0.5 * self._slope * self._step**2 / excess if excess > 0 else 0.0

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -98,3 +99,21 @@ class Solution:
     reasons: tuple[Reason, ...]
     seconds: float
     iterations: Int[Tensor, "B"] | None = None
+
+    def then(self, second: Solution) -> Solution:
+        """One that went on from here, with the histories of both."""
+        losses, errors = (
+            tuple(torch.cat(pair) for pair in zip(*both, strict=True))
+            for both in ((self.losses, second.losses), (self.errors, second.errors))
+        )
+        return Solution(
+            second.latents,
+            losses,
+            errors,
+            self.evaluations + second.evaluations,
+            second.reasons,
+            self.seconds + second.seconds,
+            self.iterations + second.iterations
+            if self.iterations is not None and second.iterations is not None
+            else None,
+        )

@@ -1,0 +1,124 @@
+"""One row of the table of editing: a solver on the clips of one choice of joints and keyframes."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from benchmarks.progress_file import Row
+from controlmm import ControlMM
+from controlmm.evaluation.batch_scores import BatchScores, score_batch
+from controlmm.evaluation.control_draws import ControlSetting
+from controlmm.evaluation.evaluators import Evaluator
+from controlmm.evaluation.motion_sources import Batch, Produced
+from controlmm.evaluation.protocol import Protocol, batches_of
+from controlmm.evaluation.scores import repeat_scores
+from controlmm.evaluation.test_set import TestSet
+from controlmm.generation.editing import EditingBudget
+from controlmm.generation.exact import meet_exactly
+from controlmm.generation.latent_editing import edit_latents
+from controlmm.generation.objective import ControlObjective
+from controlmm.models.rvq_vae import frame_mask
+from controlmm.pipelines import PRESETS, Preset
+
+UNEDITED = Preset(EditingBudget(latent_iterations=0))
+PLANS: dict[str, Preset] = {
+    "unedited": UNEDITED,
+    "gauss-newton": PRESETS["accurate"],
+    "exact": PRESETS["exact"],
+    "lbfgs": replace(PRESETS["accurate"], budget=replace(PRESETS["accurate"].budget, solver="lbfgs")),
+    "paper-fast": PRESETS["paper-fast"],
+    "paper-accurate": PRESETS["paper-accurate"],
+}
+REAL = "recorded"
+
+
+@dataclass(frozen=True)
+class Edited:
+    """A clip after editing: features (T, D), processor seconds of the editing alone, evaluations."""
+
+    features: Tensor
+    seconds: float
+    evaluations: int
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """What all rows share."""
+
+    pipeline: ControlMM
+    evaluator: Evaluator
+    test_set: TestSet
+    protocol: Protocol
+
+    def row(self, solver: str, setting: ControlSetting) -> Row:
+        """Scores of one solver. Errors, seconds and evaluations are medians over clips, the rest means."""
+        found: list[BatchScores] = []
+        clips: list[Edited] = []
+        for pairs in batches_of(self.test_set, setting, self.protocol, 0):
+            samples, masks = zip(*pairs, strict=True)
+            batch = Batch.of(samples, masks, seed=self.protocol.seed, repeat=0)
+            features = batch.real
+            if solver != REAL:
+                edited = self._edited(PLANS[solver], batch)
+                clips += edited
+                features = torch.zeros_like(batch.real)
+                for row, clip in zip(features, edited, strict=True):
+                    row[: len(clip.features)] = clip.features
+            found.append(score_batch(batch, Produced(features, 0.0, has_padding=False), self.evaluator))
+        scores = repeat_scores(found, seed=self.protocol.seed, repeat=0)
+        errors = torch.cat([scores_of.numbers["average_joint"] for scores_of in found])
+        return {
+            "error_cm": 100 * errors.median().item(),
+            "worst_cm": 100 * errors.max().item(),
+            "seconds": _median([clip.seconds for clip in clips]),
+            "evaluations": _median([float(clip.evaluations) for clip in clips]),
+            **{name: scores[name] for name in ("fid", "r3", "mm_distance", "skating", "jerk")},
+            "bones_mm": 1000 * scores["bone_deviation"],
+            "clips": len(errors),
+        }
+
+    def _edited(self, plan: Preset, batch: Batch) -> list[Edited]:
+        """All clips of a batch; their tokens are drawn together, and then each is edited alone."""
+        pipeline, budget = self.pipeline, plan.budget
+        began = time.thread_time()
+        latents = pipeline.generate_latents(
+            pipeline.text_encoder.encode([sample.caption.text for sample in batch.samples]).pooled,
+            lengths=batch.lengths.tolist(),
+            targets=batch.joints,
+            mask=batch.mask[..., None].expand_as(batch.joints),
+            seeds=batch.noise_seeds,
+            preset=replace(plan, budget=replace(budget, latent_iterations=0, solver="papers")),
+        )
+        in_logits = budget.logits_iterations * plan.steps
+        share = (time.thread_time() - began) / len(latents) if in_logits else 0.0
+        return [
+            self._clip(plan, batch, clip, latents[clip : clip + 1], share, in_logits)
+            for clip in range(len(latents))
+        ]
+
+    def _clip(
+        self, plan: Preset, batch: Batch, clip: int, latents: Tensor, seconds: float, evaluations: int
+    ) -> Edited:
+        decoder, length = self.pipeline.decoder, int(batch.lengths[clip])
+        latents = latents[:, : length // decoder.downsample]
+        targets = batch.joints[clip : clip + 1, :length]
+        mask = batch.mask[clip : clip + 1, :length, :, None].expand_as(targets)
+        frames = frame_mask(torch.tensor([length]), length)
+        began = time.thread_time()
+        if plan.budget.latent_iterations:
+            objective = ControlObjective(decoder, targets, mask, frames)
+            keep = torch.ones(1, latents.shape[1], 1)
+            solution = edit_latents(objective, latents, keep, plan.budget)
+            latents, evaluations = solution.latents, evaluations + int(solution.evaluations[0])
+        features = decoder.features(latents)[0]
+        if plan.is_exact:
+            features, _ = meet_exactly(features, targets[0], mask[0], self.pipeline.skeleton)
+        return Edited(features, seconds + time.thread_time() - began, evaluations)
+
+
+def _median(values: list[float]) -> float:
+    return torch.tensor(values).median().item() if values else 0.0
