@@ -51,9 +51,15 @@ _COLUMNS = {
 
 
 def keys_of(solvers: Sequence[str], controls: Sequence[str], densities: Sequence[int]) -> list[str]:
-    """Names of all rows, ``solver/control/density``: recordings once, then solver after solver."""
+    """Names of all rows, ``solver/control/density``: recordings once, and last what takes hours."""
     problems = [f"{control}/{density}" for control in controls for density in densities]
-    return [f"{REAL}/{problems[0]}", *(f"{solver}/{problem}" for solver in solvers for problem in problems)]
+    slow = [solver for solver in solvers if PLANS[solver].budget.logits_iterations]
+    quick = [solver for solver in solvers if solver not in slow]
+    return [
+        f"{REAL}/{problems[0]}",
+        *(f"{solver}/{problem}" for problem in problems for solver in quick),
+        *(f"{solver}/{problem}" for solver in slow for problem in problems),
+    ]
 
 
 def table(rows: Sequence[Row]) -> str:

@@ -20,6 +20,7 @@ from controlmm.generation.exact.projection import (
     project_on_targets,
 )
 from controlmm.generation.exact.refit import refit_features
+from controlmm.generation.exact.smooth_bones import solve_chain
 from controlmm.motion.features import bone_lengths, canonicalize, joints_to_features
 from controlmm.motion.skeleton import HUMANML3D
 from controlmm.ops import recover_joints
@@ -91,6 +92,36 @@ def test_bones_get_their_lengths_and_held_coordinates_stay(walk):
     assert (bone_lengths(moved, HUMANML3D) - LENGTHS)[:, 1:].abs().max() < TENTH_OF_A_MILLIMETRE
     assert torch.equal(moved[held], bent[held])
     assert (moved - bent).abs().max() < 0.2
+
+
+def test_a_chain_of_blocks_is_solved_as_the_dense_system():
+    frames, size = 5, 4
+    half = random(frames, size, size)
+    blocks = half @ half.mT + torch.eye(size)
+    ties, right = random(frames - 1, size, seed=1).abs(), random(frames, size, seed=2)
+    dense = torch.block_diag(*blocks)
+    for frame, tie in enumerate(ties):
+        here, there = slice(size * frame, size * (frame + 1)), slice(size * (frame + 1), size * (frame + 2))
+        dense[here, here] += torch.diag(tie)
+        dense[there, there] += torch.diag(tie)
+        dense[here, there] -= torch.diag(tie)
+        dense[there, here] -= torch.diag(tie)
+    expected = torch.linalg.solve(dense, right.flatten()).unflatten(0, (frames, size))
+    torch.testing.assert_close(solve_chain(blocks, ties, right), expected)
+
+
+def test_feet_that_slide_while_they_stand_are_stopped_and_nothing_shakes(walk):
+    joints = walk(30).double()
+    joints[10:20, 10] = joints[10, 10] + torch.linspace(0, 0.05, 10)[:, None] * torch.tensor([1.0, 0, 0])
+    bent = joints + 0.01 * random(30, 22, 3, seed=1)
+    planted = torch.zeros(30, 22, dtype=torch.bool)
+    planted[10:19, 10] = True
+    moved = restore_bones(bent, LENGTHS, torch.zeros(30, 22, 3, dtype=torch.bool), planted, HUMANML3D)
+    steps, before = (x[10:20, 10].diff(dim=0).norm(dim=-1).mean() for x in (moved, bent))
+    assert steps < 0.5 * before
+    jerk, shaken = (x.diff(n=3, dim=0).norm(dim=-1).mean() for x in (moved, bent))
+    assert jerk < shaken
+    assert (bone_lengths(moved, HUMANML3D) - LENGTHS)[:, 1:].abs().max() < TENTH_OF_A_MILLIMETRE
 
 
 def test_features_are_fitted_to_moved_joints(features):

@@ -23,10 +23,13 @@ class Probe:
 
     Attributes:
         residual: (N,) controlled coordinates minus their targets, metres, float64.
-        features: (T, D) de-normalised channels of the wanted joints, on the clip's own frames.
+        features: (T, D) de-normalised channels of the pelvis and of the joints that the clip controls, on
+            its own frames.
         joints: (T, J, 3) what they decode to, metres.
         mask: (T, J, 3) the controlled coordinates.
         std: (D,) of the channels.
+        columns: (D,) which they are of those that :meth:`ControlResiduals.channel_gram` knows.
+        metres: Length of one unit of the joints.
         strain: Terms of naturalness, see :class:`Naturalness`.
     """
 
@@ -35,7 +38,9 @@ class Probe:
     joints: Float[Tensor, "T J 3"]
     mask: Bool[Tensor, "T J 3"]
     std: Float[Tensor, "D"]
-    strain: float = 0.0
+    columns: Int[Tensor, "D"]
+    metres: float
+    strain: float
 
     @property
     def loss(self) -> float:
@@ -77,10 +82,11 @@ class ControlResiduals:
         self.decoder, self._targets, self._mask, self._frames = decoder, targets, mask, frames
         self.naturalness = naturalness
         self.led = tuple(joints or controlled_joints(mask))
-        self.channels = (0, 1, 2, 3, *(1 + 3 * j + axis for j in self.led[1:] for axis in range(3)))
+        self.channels = tuple(_channels_of(self.led))
         decoded = self.led if naturalness is None else tuple(range(mask.shape[2]))
         self.part = PartialDecoder(decoder, decoded, frames)
         wanted = list(self.part.joints)
+        self._own = [controlled_joints(clip[None]) for clip in mask]
         self._wanted, self._controlled = targets[:, :, wanted], mask[:, :, wanted]
         self._lengths: list[int] = frames.sum(1).tolist()
         self._prefix = prefix
@@ -117,32 +123,40 @@ class ControlResiduals:
         if self.naturalness is not None:
             self._strains = self.naturalness.values(features, self._joints)
             strains = self._strains.tolist()
-        joints, difference = self._joints.detach(), self._joints.detach() - self._wanted
-        features, std, controlled = features.detach(), part.std, self._controlled
-        if self.naturalness is not None:  # the metric looks at joints with targets only
-            led, channels = list(self.led), list(self.channels)
-            joints, controlled = joints[:, :, led], controlled[:, :, led]
-            features, std = features[..., channels], std[channels]
+        difference = self._joints.detach() - self._wanted
         return [
-            Probe(
-                difference[clip][self._controlled[clip]].double(),
-                features[clip, :length],
-                joints[clip, :length],
-                mask[:length],
-                std,
-                strains[clip],
-            )
-            for clip, (mask, length) in enumerate(zip(controlled, self._lengths, strict=True))
+            self._probe(clip, features.detach(), difference, strains[clip]) for clip in range(len(latents))
         ]
+
+    def _probe(self, clip: int, features: Tensor, difference: Tensor, strain: float) -> Probe:
+        """One clip's part; the metric looks at joints that it controls only."""
+        part, length = self.part, self._lengths[clip]
+        own = self._own[clip]
+        places = [part.joints.index(joint) for joint in own]
+        columns = _channels_of(places)
+        return Probe(
+            difference[clip][self._controlled[clip]].double(),
+            features[clip, :length][:, columns],
+            self._joints.detach()[clip, :length][:, places],
+            self._controlled[clip, :length][:, places],
+            part.std[columns],
+            torch.tensor(_channels_of([self.led.index(joint) for joint in own])),
+            self.decoder.normalizer.skeleton.metres,
+            strain,
+        )
 
     @property
     def spread(self) -> CodeSpread:
         """The unit of the latents' steps."""
         return self.decoder.spread()
 
-    def channel_gram(self, frames: int) -> Float[Tensor, "D T D T"]:
-        """Products of the decoder's rows for clips of ``frames`` frames, on average."""
-        return self.decoder.channel_gram(self.channels, frames // self.decoder.downsample)
+    def channel_gram(self, probe: Probe) -> Float[Tensor, "D T D T"]:
+        """Products of the decoder's rows for a clip, on average."""
+        frames = len(probe.features)
+        gram = self.decoder.channel_gram(self.channels, frames // self.decoder.downsample)
+        if len(probe.columns) < len(gram):
+            gram = gram[probe.columns][:, :, probe.columns]
+        return gram
 
     def pull(
         self, weights: Sequence[Float[Tensor, "N"] | None], *, strained: Sequence[bool] = ()
@@ -165,3 +179,8 @@ class ControlResiduals:
             slopes.append(torch.tensor(counts, dtype=torch.float32))
         (features,) = torch.autograd.grad(outputs, self._features, slopes, retain_graph=True)
         return self.part.pull(self._decoded, features)
+
+
+def _channels_of(joints: Sequence[int]) -> list[int]:
+    """The root's channels and those of the other joints' positions, for joints that begin with the pelvis."""
+    return [0, 1, 2, 3, *(1 + 3 * joint + axis for joint in joints[1:] for axis in range(3))]

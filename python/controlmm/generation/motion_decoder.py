@@ -33,7 +33,7 @@ class MotionDecoder(nn.Module):
         self._frozen: dict[torch.dtype, FrozenDecoder] = {}
         self._spread: tuple[tuple[int, ...], CodeSpread] | None = None
         self._sensitivities: dict[tuple[int, ...], Sensitivity] = {}
-        self._grams: dict[tuple[tuple[int, ...], int], Tensor] = {}
+        self._grams: dict[tuple[int, ...], Tensor] = {}
 
     def frozen(self, dtype: torch.dtype = torch.float32) -> FrozenDecoder:
         """The decoder's convolutions packed for editing; packed again when its weights have changed."""
@@ -51,18 +51,21 @@ class MotionDecoder(nn.Module):
     def channel_gram(self, channels: tuple[int, ...], tokens: int) -> Float[Tensor, "D T D T"]:
         """Products of the rows of the decoder's Jacobian, in the unit of :meth:`spread`; see ``sensitivity``.
 
-        Made at the first call for some channels (a fraction of a second), remembered for a few lengths.
+        Made at the first call for some channels (a fraction of a second), remembered for a few choices. A
+        shorter clip takes a part of what a longer one had.
         """
         frozen, spread = self.frozen(), self.spread()
         if channels not in self._sensitivities:
             self._sensitivities[channels] = measure_sensitivity(
                 frozen, self.typical_latents(), channels, downsample=self.downsample, spread=spread
             )
-        if (channels, tokens) not in self._grams:
+        frames = tokens * self.downsample
+        if channels not in self._grams or self._grams[channels].shape[1] < frames:
+            self._grams.pop(channels, None)
             while len(self._grams) >= _REMEMBERED:
                 self._grams.pop(next(iter(self._grams)))
-            self._grams[channels, tokens] = self._sensitivities[channels].gram(tokens)
-        return self._grams[channels, tokens]
+            self._grams[channels] = self._sensitivities[channels].gram(tokens)
+        return self._grams[channels][:, :frames, :, :frames]
 
     def spread(self) -> CodeSpread:
         """The unit of steps in latent space, of a residual tokenizer."""

@@ -1,4 +1,4 @@
-"""Bones of the right length again, targets kept: inverse kinematics frame by frame."""
+"""Bones of the right length again, targets kept: inverse kinematics of a clip, then of each frame."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controlmm.generation.exact.projection import STIFFNESS, graph_laplacian
-from controlmm.generation.exact.smooth_bones import bone_slopes
+from controlmm.generation.exact.smooth_bones import bone_slopes, smooth_bones
 from controlmm.motion.skeleton import Skeleton
 
 _ITERATIONS = 20
 _ENOUGH = 1e-5  # metres of the worst bone
 _HELD, _PLANTED, _FEET = 1e9, 1e4, 1e3  # resistance of a coordinate against change, free ones have about 1
-_WIDTH = 2.0  # frames: standard deviation of what smooths corrections in time
 _SLACK = 1e-9  # so that a chain that cannot reach gives the nearest pose instead of none
 
 
@@ -26,32 +25,19 @@ def restore_bones(
 ) -> Float[Tensor, "T J 3"]:
     """The joints moved little and smoothly so that every bone has its length; float64.
 
-    What each frame by itself would change is smoothed in time, and then each frame finds the nearest pose.
-    Held coordinates do not move, planted joints hardly; where bones cannot span what is held, lengths stay
+    First all frames together, up to a fraction of a millimetre, and then each frame finds the nearest pose.
+    Held coordinates do not move, planted joints stand; where bones cannot span what is held, lengths stay
     wrong.
 
     Args:
         joints: Positions.
         lengths: Of the bone from every joint to its parent; that of the root is not used.
         held: Coordinates that stay.
-        planted: Joints that should stay.
+        planted: Joints that stand from a frame to the next.
         skeleton: The hierarchy.
     """
-    joints = joints.double()
-    first = _restored(joints, lengths, held, planted, skeleton)
-    smoothed = torch.where(held, joints, joints + _smooth(first - joints))
-    return _restored(smoothed, lengths, held, planted, skeleton)
-
-
-def _smooth(change: Float[Tensor, "T J 3"]) -> Float[Tensor, "T J 3"]:
-    """A Gaussian average over time; the ends are continued."""
-    reach = int(4 * _WIDTH)
-    kernel = torch.exp(-0.5 * (torch.arange(-reach, reach + 1).double() / _WIDTH) ** 2)
-    rows = change.flatten(1).T[:, None]  # (3J, 1, T)
-    padded = torch.nn.functional.pad(rows, (reach, reach), mode="replicate")
-    smoothed = torch.nn.functional.conv1d(padded, (kernel / kernel.sum())[None, None])
-    result: Tensor = smoothed[:, 0].T.unflatten(1, change.shape[1:])
-    return result
+    smooth = smooth_bones(joints, lengths, held, planted, skeleton)
+    return _restored(smooth, lengths, held, planted, skeleton)
 
 
 def _restored(

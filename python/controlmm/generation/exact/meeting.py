@@ -16,7 +16,7 @@ from controlmm.motion.layout import feature_layout
 from controlmm.motion.skeleton import Skeleton
 from controlmm.ops import recover_joints
 
-_PLANTED_SPEED = 0.5  # metres a second; a foot in contact that is faster slides already
+_PLANTED_SPEED = 1.0  # metres a second; a foot in contact that is faster is no longer standing
 _CONTACT = 0.5  # of the contact channels
 _PER_METRE = {"m": 1.0, "mm": 1000.0}
 
@@ -81,7 +81,7 @@ def meet_exactly(
 def planted_feet(
     features: Float[Tensor, "T D"], joints: Float[Tensor, "T J 3"], skeleton: Skeleton
 ) -> Bool[Tensor, "T J"]:
-    """Joints of the feet that stand in a frame and the next: in contact, and slower than 0.5 m/s."""
+    """Joints of the feet that stand in a frame and the next: in contact, and slower than 1 m/s."""
     feet = skeleton.foot_joints
     in_contact = features[:, feature_layout(skeleton).foot_contacts] > _CONTACT
     speed = joints[:, feet][..., [0, 2]].diff(dim=0).norm(dim=-1) * skeleton.fps / _PER_METRE[skeleton.unit]

@@ -21,7 +21,7 @@ _STEPS = 4
 _STEADY = 100.0  # w, of changes from frame to frame
 _STANDS = 1e4  # p
 _BONES = 1e5  # m
-_HELD, _FOOT = 1e9, 100.0  # resistance of a coordinate; free ones have about 1
+_HELD, _FOOT = 1e9, 1e3  # resistance of a coordinate; free ones have about 1
 
 
 def smooth_bones(

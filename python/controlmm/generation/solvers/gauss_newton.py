@@ -23,7 +23,8 @@ from controlmm.generation.solvers.metric import Metric
 from controlmm.generation.solvers.natural_way import STEPS, NaturalWay
 from controlmm.generation.solvers.stopping import Reason, Solution, Stopping, Watch
 
-_EARLY_RENEWALS, _STEPS_OF_A_METRIC = (2, 5), 10  # steps after which a metric is made anew
+_EARLY_RENEWALS, _STEPS_OF_A_METRIC = (2, 5), 10  # steps after which a metric may be made anew
+_STALE = 0.1  # metres of the way or radians of the heading: by so much less, an old metric is as good
 _HISTORY = 20
 _SUFFICIENT_DECREASE = 1e-4
 _MOST_HALVINGS = 8
@@ -87,6 +88,7 @@ class _Descent:
         self._residuals, self._iterations, self._done = residuals, iterations, -1
         self._memory = Curvature(_HISTORY)
         self._metric: Metric | None = None
+        self._way = start.new_zeros(0, 3)
         self._value, self._slope = math.inf, 0.0
         self._gradient: Tensor | None = None
         self._halvings = 0
@@ -111,7 +113,8 @@ class _Descent:
             self._shorten(value)
             return None
         self._done += 1
-        if self._done in _EARLY_RENEWALS or (self._done and self._done % _STEPS_OF_A_METRIC == 0):
+        is_due = self._done in _EARLY_RENEWALS or (self._done and self._done % _STEPS_OF_A_METRIC == 0)
+        if is_due and (_way(probe) - self._way).abs().max() > _STALE:
             self._renew(probe)
             value, weights = self._weigh(probe)
         if self._natural is not None and self._natural.ends(self._done):
@@ -167,7 +170,8 @@ class _Descent:
 
     def _renew(self, probe: Probe) -> None:
         """The metric of the clip as it now is; gradients of the old one cannot be compared with new ones."""
-        self._metric = Metric(probe.rows(), self._residuals.channel_gram(len(probe.features)), probe.mask)
+        self._way = _way(probe)
+        self._metric = Metric(probe.rows(), self._residuals.channel_gram(probe), probe.mask)
         self._memory.clear()
         self._gradient = None
 
@@ -181,3 +185,9 @@ class _Descent:
         best = -0.5 * self._slope * self._step**2 / excess if excess > 0 else 0.0
         self._step = min(max(best, 0.1 * self._step), 0.5 * self._step)
         self.point = self._origin + self._step * self._direction
+
+
+def _way(probe: Probe) -> Float[Tensor, "T 3"]:
+    """Where the root is on the ground in metres, and its heading in radians."""
+    heading = 2 * probe.features[:, :1].cumsum(0)
+    return torch.cat([probe.joints[:, 0, [0, 2]] * probe.metres, heading], dim=1)

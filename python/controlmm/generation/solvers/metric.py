@@ -11,7 +11,7 @@ from torch import Tensor
 from controlmm.generation.kinematic_rows import KinematicRows
 
 _DAMPING = 0.03  # times the mean of the diagonal (Levenberg and Marquardt's lambda)
-_MOST_UNKNOWNS = 640  # dense matrices of this size cost less than an evaluation of the decoder
+_MOST_UNKNOWNS = 400  # a dense matrix of this size costs no more than an evaluation of the decoder
 
 
 class Metric:
