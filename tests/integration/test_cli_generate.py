@@ -184,6 +184,10 @@ BAD_OPTIONS = {
     "no prompt": ([], r"Give a prompt"),
     "missing model folder": (["walk", "--model", "nowhere"], r"No model folder at nowhere"),
     "missing control file": (["walk", "--controls", "nowhere.json"], r"No control file at nowhere\.json"),
+    "negative naturalness": (
+        ["walk", "--naturalness", "-1"],
+        r"`naturalness` must be a number of at least 0",
+    ),
     "unknown preset": (["walk", "--preset", "best"], r"Unknown `preset` 'best'.*fast"),
     "unknown format": (["walk", "--formats", "npz,fbx"], r"`--formats` must name some of .*bvh.*'npz,fbx'"),
     "no format": (["walk", "--formats", ","], r"`--formats` must name some of"),

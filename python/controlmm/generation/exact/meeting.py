@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -18,6 +19,7 @@ from controlmm.ops import recover_joints
 
 _PLANTED_SPEED = 1.0  # metres a second; a foot in contact that is faster is no longer standing
 _CONTACT = 0.5  # of the contact channels
+_NOTHING = 1e-4  # of the skeleton's unit: a motion so near its targets, with such bones, stays as it is
 _PER_METRE = {"m": 1.0, "mm": 1000.0}
 
 
@@ -55,27 +57,41 @@ def meet_exactly(
     """
     joints = recover_joints(features[None].double(), joints=skeleton.num_joints)[0]
     targets = targets.double()
+    lengths = _lengths(joints, skeleton)
+    if _residual(joints, targets, mask) <= _NOTHING and _bone_error(joints, lengths, skeleton) <= _NOTHING:
+        return features, _report((joints, joints), targets, mask, features, lengths, skeleton)
     held = mask.clone()
     held[0, 0, [0, 2]] = True  # features begin with the root at x = z = 0
     wanted = torch.where(mask, targets, joints)
-    lengths = _lengths(joints, skeleton)
     planted = planted_feet(features, joints, skeleton)
     moved = project_on_targets(joints, wanted, held, planted, skeleton)
     moved = restore_bones(moved, lengths, held, planted, skeleton)
     fitted = refit_features(features, moved, skeleton)
     after = recover_joints(fitted[None], joints=skeleton.num_joints)[0].double()
-    unit = _PER_METRE[skeleton.unit]
+    return fitted, _report((joints, after), targets, mask, features, lengths, skeleton)
 
-    def both(measure: float, again: float) -> tuple[float, float]:
-        return measure / unit, again / unit
 
-    report = ExactReport(
-        residual=both(_residual(joints, targets, mask), _residual(after, targets, mask)),
-        bone_error=both(*(_bone_error(clip, lengths, skeleton) for clip in (joints, after))),
-        jerk=both(*(_jerk(clip, skeleton) for clip in (joints, after))),
-        slide=both(*(_slide(clip, planted, skeleton) for clip in (joints, after))),
+def _report(
+    clips: tuple[Tensor, Tensor],
+    targets: Tensor,
+    mask: Tensor,
+    features: Tensor,
+    lengths: Tensor,
+    skeleton: Skeleton,
+) -> ExactReport:
+    """Joints before and after, measured; feet are planted as they were before."""
+    planted = planted_feet(features, clips[0], skeleton)
+
+    def both(measure: Callable[[Tensor], float]) -> tuple[float, float]:
+        before, after = (measure(clip) / _PER_METRE[skeleton.unit] for clip in clips)
+        return before, after
+
+    return ExactReport(
+        residual=both(lambda clip: _residual(clip, targets, mask)),
+        bone_error=both(lambda clip: _bone_error(clip, lengths, skeleton)),
+        jerk=both(lambda clip: _jerk(clip, skeleton)),
+        slide=both(lambda clip: _slide(clip, planted, skeleton)),
     )
-    return fitted, report
 
 
 def planted_feet(

@@ -2,7 +2,7 @@
 
 Minimises over all joints ``x`` of a clip, with ``d = x - start``,
 
-    d^T R d + w |d_{t+1} - d_t|^2 + p |x_{t+1} - x_t|^2 (planted feet) + m (|bone| - length)^2
+    d^T R d + w |d_{t+1} - d_t|^2 + p |x_{t+1} - x_t|^2 (planted toes) + m (|bone| - length)^2
 
 by Gauss-Newton's method; R = 10 L + 1 with the skeleton's Laplacian, as in ``projection``. Frames meet only
 their neighbours, coordinate by coordinate, so that a step is one sweep through the clip and one back.
@@ -37,7 +37,7 @@ def smooth_bones(
         start: Positions.
         lengths: Of the bone from every joint to its parent; that of the root is not used.
         held: Coordinates that stay.
-        planted: Joints that stand from a frame to the next.
+        planted: Joints of the feet that stand from a frame to the next.
         skeleton: The hierarchy.
     """
     start = start.double()
@@ -47,11 +47,13 @@ def smooth_bones(
     resistance = resistance + torch.diag_embed(extra.flatten(1))
     stands = _STANDS * planted[:-1, :, None].expand(-1, -1, 3).double().flatten(1)  # (T-1, 3J)
     stands = stands.where(~(held[:-1] & held[1:]).flatten(1), 0.0)
-    moved = start
+    is_toe = torch.zeros(start.shape[1:], dtype=torch.bool)
+    is_toe[[skeleton.left_foot[1], skeleton.right_foot[1]]] = True  # an ankle turns about it: its steps stay
+    is_toe, moved = is_toe.flatten(), start
     for _ in range(_STEPS):
         slopes, short = bone_slopes(moved, lengths, skeleton)
         change = (moved - start).flatten(1)
-        step = moved.flatten(1).diff(dim=0)
+        step = torch.where(is_toe, moved.flatten(1).diff(dim=0), change.diff(dim=0))
         pull = _STEADY * change.diff(dim=0) + stands * step
         force = -(resistance @ change[..., None])[..., 0] + _BONES * (slopes.mT @ short[..., None])[..., 0]
         force[:-1] += pull
