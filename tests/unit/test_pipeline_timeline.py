@@ -120,14 +120,14 @@ def test_tracks_are_made_apart_and_see_the_controls_of_their_joints(tiny_pipelin
     ]
     goal = JointControl("pelvis", frames=[0, 59], positions=[[1, None, 2], [1, None, 4]])
     hand = JointControl("right_wrist", frames=[30], positions=[[1, 1.3, 3]])
-    result = tiny_pipeline.timeline(entries, controls=[goal, hand], preset=SOLVED, samples=2)
+    result = tiny_pipeline.timeline(entries, controls=[goal, hand], preset=SOLVED, samples=2, seed=1)
     (call,) = passes
     assert call["lengths"] == [60, 60, 26, 26]  # the wave with a transition on either side
     assert torch.equal(call["text"][0], call["text"][1])
     assert not torch.equal(call["text"][1], call["text"][2])
     assert [sorted(set(clip.nonzero()[:, 1].tolist())) for clip in call["mask"]] == [[0], [0], [], []]
     torch.testing.assert_close(call["targets"][0, 59, 0], torch.tensor([0.0, 0.0, 2.0]))
-    blind = tiny_pipeline.timeline(entries, preset=SOLVED).best
+    blind = tiny_pipeline.timeline(entries, preset=SOLVED, seed=1).best
     for frame, joint, place in ((59, 0, [1.0, 0.0, 4.0]), (30, 21, [1.0, 1.3, 3.0])):
         off = [(m.joints[frame, joint] - torch.tensor(place))[[0, 2]].norm() for m in (*result, blind)]
         assert max(off[:2]) < 0.7 * off[2]  # an untrained model has steps to hold that lead elsewhere
