@@ -21,7 +21,7 @@ from controlmm.motion.skeleton import Skeleton
 from controlmm.ops import recover_joints
 
 _IS_CONTACT = 0.5  # of a contact channel, which is 1 at rest and 0 in motion
-_FLOOR_SECONDS = 1.0  # to each side: within it a foot touches the ground
+_FLOOR_SECONDS = 0.5  # to each side: within it a foot touches the ground, unless a jump is high
 _MEANT_CLIMB = 0.5  # metres: a start that climbs by more means to (stairs), and its floor is left alone
 _VELOCITY, _JERK = 1, 3  # orders of differences in time
 
@@ -41,7 +41,7 @@ class NaturalWeights:
     nearness: float = 0.005
     steadiness: float = 2.0
     feet: float = 10.0
-    floor: float = 0.5
+    floor: float = 10.0
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
