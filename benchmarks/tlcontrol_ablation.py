@@ -16,6 +16,7 @@ from torch import Tensor
 
 from benchmarks.tlcontrol import JOINT_SETS, Clips, markdown, read_clips
 from controlmm.evaluation.control_errors import control_errors
+from controlmm.evaluation.published_tables import published_table
 from controlmm.generation.code_optimization import CodeOptimization, optimize_codes
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.models.part_vq_vae import PartVqVae
@@ -95,7 +96,9 @@ def main() -> None:
                     f"{sum(row[2] for row in done) / count:.2f}",
                 )
             )
-    print(f"{count} clips, {torch.get_num_threads()} threads\n\n{markdown(rows)}")
+    published = published_table("tl-supplement1")
+    print(f"Published:\n\n{markdown([published.columns, *published.rows])}\n")
+    print(f"Ours, {count} clips, {torch.get_num_threads()} threads:\n\n{markdown(rows)}")
 
 
 if __name__ == "__main__":
