@@ -251,7 +251,7 @@ def test_a_timeline_file_is_generated_pass_by_pass(
     ]
     printed = command(
         "generate", "--timeline", save_controls(ControlFile(timeline=entries), tmp_path / "timeline.json"),
-        "--preset", "fast", "--formats", "npz,png", "--out", tmp_path / "out",
+        "--method", "passes", "--preset", "fast", "--formats", "npz,png", "--out", tmp_path / "out",
         "--model", tiny_pipeline_folder,
     )  # fmt: skip
     motion = Motion.load(tmp_path / "out" / "a-person-walks_0_0.npz")
@@ -336,6 +336,7 @@ def test_a_motion_is_edited_under_the_controls_and_obstacles_of_files(
         ),
         (("--edit", "a.npz", "--timeline", "t.json"), "`--timeline` and `--edit` do not go together."),
         (("--timeline", "t.json"), "A timeline has prompts of its own. Leave the prompt out."),
+        (("--method", "passes"), "`--method` is for timelines. Name one with `--timeline FILE`."),
         (("--timeline", "line.json"), 'line.json holds no timeline. Give it as "timeline": [...]'),
         (("--timeline", "t.json", "--seconds", "2"), "`--timeline` and `--seconds` do not go together."),
     ],

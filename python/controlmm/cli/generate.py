@@ -43,6 +43,10 @@ def generate(
     timeline: Annotated[
         Path | None, typer.Option(help="JSON file that says what each body part does when.")
     ] = None,
+    method: Annotated[
+        str | None,
+        typer.Option(help="How a timeline is made: tracks, passes or published.", show_default="tracks"),
+    ] = None,
     edit: Annotated[
         Path | None, typer.Option(help="Motion to change: .npz, .npy or .bvh; see --keep and --keep-part.")
     ] = None,
@@ -101,7 +105,7 @@ def generate(
     entries = timeline_entries(document, timeline)
     check_together(
         edit=edit, has_timeline=bool(entries), keep=keep, keep_part=keep_part, loose=loose, controls=controls,
-        obstacles=obstacles, seconds=seconds, vary=vary,
+        obstacles=obstacles, seconds=seconds, vary=vary, method=method,
     )  # fmt: skip
     avoided = all_obstacles(document, obstacles)
     if entries and prompt is not None:
@@ -127,6 +131,7 @@ def generate(
         plan = pipeline.limited(pipeline.resolve_preset(preset, guidance), None, None, naturalness)
         options |= {"progress": bars, "preset": plan, **parts}
         if entries:
+            options |= {} if method is None else {"method": method}
             result = pipeline.timeline(entries, controls=held, obstacles=avoided, **options)
         elif source is not None:
             assert isinstance(pipeline, ControlMM | TLControl)

@@ -94,11 +94,13 @@ def check_together(*, edit: Path | None, has_timeline: bool, **others: object) -
         )
     for first, is_there, allowed in (
         ("--edit", edit is not None, {"keep", "keep-part", "loose", "controls", "obstacles"}),
-        ("--timeline", has_timeline, {"controls", "obstacles"}),
+        ("--timeline", has_timeline, {"controls", "obstacles", "method"}),
         ("--controls", edit is None and not has_timeline, {"controls", "obstacles", "seconds", "vary"}),
     ):
         if is_there and given - allowed:
             name = sorted(given - allowed)[0]
+            if name == "method":
+                raise ValueError("`--method` is for timelines. Name one with `--timeline FILE`.")
             if first == "--controls":
                 raise ValueError(
                     f"`--{name}` says what of a motion to keep. Name the motion with `--edit FILE`."
