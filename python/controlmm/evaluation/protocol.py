@@ -20,10 +20,10 @@ from controlmm.evaluation.control_draws import ControlSetting, draw_mask
 from controlmm.evaluation.evaluators import Evaluator
 from controlmm.evaluation.frechet import frechet_distance
 from controlmm.evaluation.motion_sources import Batch, Generated, MotionSource, RealMotion, padded_features
-from controlmm.evaluation.multimodality import MOTIONS, row_multimodality
 from controlmm.evaluation.random_streams import stream
 from controlmm.evaluation.retrieval import GROUP
 from controlmm.evaluation.row_folders import labelled_folders, shared_folders
+from controlmm.evaluation.row_multimodality import MOTIONS, row_multimodality
 from controlmm.evaluation.scores import RowScores, repeat_scores
 from controlmm.evaluation.test_set import MAX_FRAMES, Sample, TestSet
 
