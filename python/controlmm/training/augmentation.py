@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -18,8 +20,9 @@ from controlmm.training.caption_truth import joined_captions, true_at_other_spee
 from controlmm.training.motion_changes import BLEND_FRAMES, along_bent_way, at_speed, joined, pose_distance
 
 _SPEEDS = 0.8, 1.25
-_BENDS = 25.0, 75.0  # degrees in all, to either side
+_SMALLEST_BEND = 25.0  # degrees in all, to either side
 _SHORTEST_WAY = 1.5  # metres that a clip must cover to be bent
+_NARROWEST = 1.0  # metres: radius of the tightest bend
 _CANDIDATES = 24  # second clips that are tried for a first one
 _NEAR_POSES = 0.12  # metres; poses further apart are not joined
 _LONGEST, _SHORTEST = 196, 40  # frames of a new clip
@@ -34,13 +37,16 @@ class Augmentation:
 
     joined_share: float = 0.0  # two clips in a row at matching poses, "..., then ..."
     speed_share: float = 0.0  # 0.8 to 1.25 times as fast
-    bent_share: float = 0.0  # ways bent by 25 to 75 degrees
+    bent_share: float = 0.0  # ways bent by 25 degrees or more
+    largest_bend: float = 75.0  # degrees; never so many that the radius falls under a metre
     augmentation_seed: int = 0
 
     def __post_init__(self) -> None:
         for name in ("joined_share", "speed_share", "bent_share"):
             if not 0 <= getattr(self, name) <= 10:
                 raise ValueError(f"`{name}` must be between 0 and 10, got {getattr(self, name)}.")
+        if not _SMALLEST_BEND <= self.largest_bend <= 720:
+            raise ValueError(f"`largest_bend` must be between 25 and 720 degrees, got {self.largest_bend}.")
 
 
 def augmented(clips: Sequence[FeatureClip], augmentation: Augmentation) -> list[FeatureClip]:
@@ -50,10 +56,11 @@ def augmented(clips: Sequence[FeatureClip], augmentation: Augmentation) -> list[
     """
     made: list[FeatureClip] = []
     generator = torch.Generator().manual_seed(augmentation.augmentation_seed)
+    bend = partial(_bend, largest=augmentation.largest_bend)
     for share, make in (
         (augmentation.joined_share, _join),
         (augmentation.speed_share, _hasten),
-        (augmentation.bent_share, _bend),
+        (augmentation.bent_share, bend),
     ):
         made += _some(clips, round(share * len(clips)), make, generator)
     return made
@@ -102,12 +109,16 @@ def _hasten(clips: Sequence[FeatureClip], generator: torch.Generator) -> Feature
     )
 
 
-def _bend(clips: Sequence[FeatureClip], generator: torch.Generator) -> FeatureClip | None:
+def _bend(
+    clips: Sequence[FeatureClip], generator: torch.Generator, *, largest: float
+) -> FeatureClip | None:
     clip = _draw(clips, generator)
-    degrees = _uniform(*_BENDS, generator) * (1 if torch.rand((), generator=generator) < 0.5 else -1)
-    captions = true_on_bent_way(clip.captions)
     joints = _joints(clip)
-    way = (joints[-1, 0] - joints[0, 0])[[0, 2]].norm() * _metres(clip)
+    way = float((joints[-1, 0] - joints[0, 0])[[0, 2]].norm()) * _metres(clip)
+    most = min(largest, math.degrees(way / _NARROWEST))
+    side = 1 if torch.rand((), generator=generator) < 0.5 else -1
+    degrees = side * _uniform(_SMALLEST_BEND, most, generator)
+    captions = true_on_bent_way(clip.captions)
     if not captions or way < _SHORTEST_WAY:
         return None
     return FeatureClip(

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
 from controlmm.generation.motion_decoder import MotionDecoder
@@ -34,6 +35,8 @@ SETTINGS = {
 _ALPHA: dict[MaskMode, float] = {"mixed": 0.1, "trajectory": 0.1, "random": 0.5, "cross": 0.5}
 _VALIDATION_BATCH = 50
 
+FinerLayers = Literal["recorded", "none"]
+
 
 @dataclass(frozen=True)
 class ControlOptions:
@@ -45,9 +48,17 @@ class ControlOptions:
     norm: Norm = "l1"  # of the consistency loss; paper: l2, a distance for each controlled joint
     drops_text: bool = True  # as the paper; the published code never does
     share_of: int | None = None  # as in `MaskedOptions`
+    # Residual codes in the motion that the consistency loss sees; published: none. Base codes alone miss even
+    # their own recording's path by far, so without the finer layers this loss pulls against the cross-entropy.
+    finer_layers: FinerLayers = "recorded"
 
     def __post_init__(self) -> None:
-        for name, kind in (("masks", MaskMode), ("sampling", Sampling), ("norm", Norm)):
+        for name, kind in (
+            ("masks", MaskMode),
+            ("sampling", Sampling),
+            ("norm", Norm),
+            ("finer_layers", FinerLayers),
+        ):
             if getattr(self, name) not in get_args(kind):
                 raise ValueError(f"`{name}` must be one of {get_args(kind)}, got {getattr(self, name)!r}.")
         if self.alpha is not None and not 0 <= self.alpha <= 1:
@@ -123,6 +134,8 @@ class ControlRecipe:
         sequence = base.sequence(base.embed(corrupted), text)
         logits = self.model(base, sequence, self.model.signal(targets, mask, current), batch.valid).float()
         latents = mixed_codes(logits, decoder.tokenizer.base_codes, self.options.sampling)
+        if self.options.finer_layers == "recorded":
+            latents = latents + decoder.tokenizer.quantizer.lookup(without_base(batch.ids))
         joints = decoder(latents * batch.valid[..., None], frames)
         metres = skeleton.metres
         consistency = masked_consistency_loss(joints * metres, targets * metres, mask, norm=self.options.norm)
@@ -135,6 +148,11 @@ class ControlRecipe:
         return recover_joints(
             self.decoder.normalizer.denormalize(features), joints=self.decoder.normalizer.skeleton.num_joints
         )
+
+
+def without_base(ids: Int[Tensor, "B L Q"]) -> Int[Tensor, "B L Q"]:
+    """The codes of the residual layers; -1, which stands for no code, in the base layer."""
+    return torch.cat([torch.full_like(ids[..., :1], -1), ids[..., 1:]], dim=-1)
 
 
 def _build(config: ControlBranchConfig, inputs: StageInputs) -> Recipe:
