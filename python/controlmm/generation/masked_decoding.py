@@ -13,6 +13,7 @@ from torch import Tensor
 
 from controlmm.generation.decoding_rules import DecodingRules, likeliest_share
 from controlmm.generation.editing import EditingBudget, edit_logits
+from controlmm.generation.controlled_layers import ControlledLayers
 from controlmm.generation.kept_tokens import KeptTokens
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.noise import ClipNoise
@@ -165,10 +166,12 @@ def fill_residual_layers(
     request: DecodingRequest,
     *,
     guidance_scale: float = 5.0,
+    control: ControlledLayers | None = None,
 ) -> Int[Tensor, "B L Q"]:
     """All layers of codes, by default the most likely one in each residual layer.
 
-    -1 in padding, and where "no code" wins if the rules let it.
+    With ``control`` each layer makes up for what the ones before it miss of the targets. -1 in padding, and
+    where "no code" wins if the rules let it.
     """
     layers = [base_ids]
     for layer in range(1, residual.config.num_quantizers):
@@ -176,7 +179,8 @@ def fill_residual_layers(
         missing = torch.full_like(base_ids, -1)
         ids = torch.stack(layers + [missing] * (residual.config.num_quantizers - layer), dim=-1)
         history = residual.history(ids, number)
-        predict = partial(residual, history, number, valid=request.valid)
+        hints = None if control is None else control.hints(ids, number, request.valid)
+        predict = partial(residual, history, number, valid=request.valid, hints=hints)
         logits = guided(predict, request, scale=guidance_scale)
         if not request.rules.pad_class:
             logits = logits[..., : residual.pad_id]  # a valid position always has a code

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
-from torch.nn.functional import one_hot
+from torch.nn.functional import one_hot, pad
 
 from controlmm.models.masked_transformer import with_text_token
 from controlmm.nn.checkpoint import PretrainedModel
@@ -157,13 +158,21 @@ class ResidualTransformer(PretrainedModel):
         layer: Int[Tensor, "B"],
         text: Float[Tensor, "B D"],
         valid: Bool[Tensor, "B L"],
+        hints: Sequence[Float[Tensor, "B L W"]] | None = None,
     ) -> Float[Tensor, "B L R"]:
-        """Logits of layer ``layer`` (1..Q-1), codes and PAD."""
+        """Logits of layer ``layer`` (1..Q-1), codes and PAD.
+
+        ``hints`` of a :class:`ResidualControl` are added to the motion tokens: the first to the input, the
+        others to what each transformer layer puts out.
+        """
         tokens = self.dropout(self.token_proj(history) + self.positions[: history.shape[1]])
         text_token = self.text_proj(text * self.config.text_scale)[:, None]
         layer_token = self.layer_proj(one_hot(layer, self.config.num_quantizers).to(tokens.dtype))[:, None]
+        if hints is not None:
+            tokens = tokens + hints[0]
+            hints = [pad(hint, (0, 0, 2, 0)) for hint in hints[1:]]  # nothing for text and layer
         sequence = torch.cat([text_token, layer_token, tokens], dim=1)
-        hidden = run_layers(self.layers, sequence, with_text_token(valid, 2))
+        hidden = run_layers(self.layers, sequence, with_text_token(valid, 2), hints)
         predicted: Tensor = self.head(hidden[:, 2:])
         logits = torch.einsum("ble,bre->blr", predicted, self.output_tables()[layer - 1])
         return logits if self.config.shares_tables else logits + self.output_bias[layer - 1][:, None]

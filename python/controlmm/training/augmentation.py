@@ -109,9 +109,7 @@ def _hasten(clips: Sequence[FeatureClip], generator: torch.Generator) -> Feature
     )
 
 
-def _bend(
-    clips: Sequence[FeatureClip], generator: torch.Generator, *, largest: float
-) -> FeatureClip | None:
+def _bend(clips: Sequence[FeatureClip], generator: torch.Generator, *, largest: float) -> FeatureClip | None:
     clip = _draw(clips, generator)
     joints = _joints(clip)
     way = float((joints[-1, 0] - joints[0, 0])[[0, 2]].norm()) * _metres(clip)

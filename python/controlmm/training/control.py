@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import torch
-from jaxtyping import Int
 from torch import Tensor
 
+from controlmm.generation.controlled_layers import without_base
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.models.control_branch import ControlBranch, ControlBranchConfig
 from controlmm.models.masked_transformer import MaskedTransformer
@@ -148,11 +148,6 @@ class ControlRecipe:
         return recover_joints(
             self.decoder.normalizer.denormalize(features), joints=self.decoder.normalizer.skeleton.num_joints
         )
-
-
-def without_base(ids: Int[Tensor, "B L Q"]) -> Int[Tensor, "B L Q"]:
-    """The codes of the residual layers; -1, which stands for no code, in the base layer."""
-    return torch.cat([torch.full_like(ids[..., :1], -1), ids[..., 1:]], dim=-1)
 
 
 def _build(config: ControlBranchConfig, inputs: StageInputs) -> Recipe:

@@ -20,6 +20,7 @@ MODULES = {
     "masked": "masked",
     "residual": "residual",
     "control": "control",
+    "residual-control": "residual_control",
     "length": "length",
     "evaluator": "evaluator",
     "tl-vq": "tl_vq",

@@ -1,0 +1,40 @@
+"""What residual layers see of the targets when they are filled in under control."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from controlmm.generation.motion_decoder import MotionDecoder
+from controlmm.models.residual_control import ResidualControl
+
+
+@dataclass(frozen=True)
+class ControlledLayers:
+    """A batch's targets, and the base layer that they are to be reached from."""
+
+    network: ResidualControl
+    decoder: MotionDecoder
+    targets: Float[Tensor, "B T J 3"]  # global, in the skeleton's unit
+    mask: Bool[Tensor, "B T J 3"]
+    base: Float[Tensor, "B L C"]  # latents of the base layer, which may be a mean of codes
+
+    def hints(
+        self, ids: Int[Tensor, "B L Q"], layer: Int[Tensor, "B"], valid: Bool[Tensor, "B L"]
+    ) -> list[Float[Tensor, "B L W"]]:
+        """For the residual transformer that predicts ``layer``; ``ids`` are -1 in layers that are to come."""
+        finer = self.decoder.tokenizer.quantizer.lookup(without_base(ids))
+        frames = valid.repeat_interleave(self.decoder.downsample, dim=1)
+        current = self.decoder(self.base + finer, frames)
+        hints: list[Tensor] = self.network(
+            self.network.signal(self.targets, self.mask, current), layer, valid
+        )
+        return hints
+
+
+def without_base(ids: Int[Tensor, "B L Q"]) -> Int[Tensor, "B L Q"]:
+    """The codes of the residual layers; -1, which stands for no code, in the base layer."""
+    return torch.cat([torch.full_like(ids[..., :1], -1), ids[..., 1:]], dim=-1)
