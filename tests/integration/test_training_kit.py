@@ -10,6 +10,7 @@ from controlmm.controls import JointControl
 from controlmm.data import Caption, Clip, write_folder
 from controlmm.models.control_branch import ControlBranch
 from controlmm.models.masked_transformer import MaskedTransformer
+from controlmm.models.residual_control import ResidualControl
 from controlmm.models.residual_transformer import ResidualTransformer
 from controlmm.motion.skeleton import KIT
 from controlmm.pipelines import ControlMM
@@ -99,6 +100,7 @@ def test_the_trained_parts_make_a_pipeline_that_is_controlled(trained):
         transformer=MaskedTransformer.from_pretrained(trained / "masked" / "best"),
         residual=ResidualTransformer.from_pretrained(trained / "residual" / "best"),
         control=branch_of(trained),
+        residual_control=ResidualControl.from_pretrained(trained / "residual-control" / "best"),
         text_encoder=HashingTextEncoder(64),
     )
     control = JointControl("LW", frames=[4, 20], positions=[[50, 500, 0], [50, 500, 300]])

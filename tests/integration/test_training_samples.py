@@ -10,7 +10,7 @@ from controlmm.ops import recover_joints
 from controlmm.text.hashing import HashingTextEncoder
 from controlmm.training.stages import train_stage
 
-STAGES = ("rvq", "rvq-decoder", "masked", "residual", "control")
+STAGES = ("rvq", "rvq-decoder", "masked", "residual", "control", "residual-control")
 ROUNDING = 1e-4  # metres: the clips went through normalisation and back
 
 

@@ -22,7 +22,7 @@ from controlmm.training.stage import load_tokenizer
 from controlmm.training.stages import train_stage
 from controlmm.training.step import StepTaker
 
-STAGES = ("rvq", "rvq-decoder", "masked", "residual", "control")
+STAGES = ("rvq", "rvq-decoder", "masked", "residual", "control", "residual-control")
 QUICK = {"steps": 10, "validate_every": 5, "average_decay": 0.9}
 
 
@@ -103,7 +103,7 @@ def test_a_killed_and_resumed_stage_equals_the_unbroken_one_bit_by_bit(
 ):
     tokenizer = ("normalizer.safetensors", "rvq/best")
     earlier = {"rvq": (), "rvq-decoder": tokenizer}.get(
-        stage, (*tokenizer, "rvq-decoder/best", "masked/best")
+        stage, (*tokenizer, "rvq-decoder/best", "masked/best", "residual/best")
     )
     for name in {*earlier} - {f"{stage}/best"}:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)

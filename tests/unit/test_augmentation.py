@@ -204,9 +204,27 @@ def test_the_seed_decides_and_nothing_is_made_by_default(clips):
     assert [c.id for c in other] != [c.id for c in first]
 
 
+def test_large_bends_stay_as_wide_as_somebody_can_walk(walk):
+    """A way of 5 m holds a circle of a metre's radius not quite once: 5 rad are 286 degrees."""
+    features = joints_to_features(walk(101, turn=0.0, speed=0.05), public_quirks=False)
+    clips = [FeatureClip("way", features, captions("a person walks"), "lab")]
+    way = float(recover_joints(features[None], joints=22)[0, :, 0].diff(dim=0).norm(dim=-1).sum())
+    for largest, most in ((75.0, 75.0), (360.0, math.degrees(way))):
+        made = augmented(clips, Augmentation(bent_share=10, largest_bend=largest))
+        degrees = [abs(float(clip.id.split("@")[1].split("~")[0])) for clip in made]
+        assert len(degrees) == 10
+        assert 25 <= min(degrees) <= max(degrees) <= most + 0.5
+        assert max(degrees) > 0.8 * most
+
+
 def test_clips_without_true_captions_are_not_made(clips):
     silent = [FeatureClip(c.id, c.features, captions("a man slowly turns left"), c.source) for c in clips]
     assert augmented(silent, Augmentation(speed_share=1.0, bent_share=1.0)) == []
+
+
+def test_impossible_bends_are_refused():
+    with pytest.raises(ValueError, match=r"`largest_bend` must be between 25 and 720 degrees, got 10"):
+        Augmentation(largest_bend=10)
 
 
 def test_impossible_shares_are_refused():

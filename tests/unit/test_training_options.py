@@ -16,7 +16,8 @@ from controlmm.models.control_branch import ControlBranchConfig
 from controlmm.models.masked_transformer import MaskedTransformer, MaskedTransformerConfig
 from controlmm.models.rvq_vae import RvqVae, RvqVaeConfig, frame_mask
 from controlmm.motion.normalizer import Normalizer
-from controlmm.ops import recover_joints
+from controlmm.motion.skeleton import HUMANML3D
+from controlmm.ops import masked_consistency_loss, recover_joints
 from controlmm.training.changes import with_changes
 from controlmm.training.control import ControlOptions, ControlRecipe
 from controlmm.training.control_masks import sample_masks
@@ -132,6 +133,30 @@ def test_sampling_changes_the_consistency_loss(decoder, samplers, base):
 
 
 # --- consistency loss and weights (rows 4 and 6) ---
+
+
+def test_the_consistency_loss_sees_the_recorded_finer_layers_unless_switched_off(decoder, samplers, base):
+    """With logits that leave no doubt about the recorded base codes, the recorded motion comes out whole."""
+    losses = {}
+    batch = samplers[0].whole([0, 1, 2])
+    certain = 1e4 * torch.nn.functional.one_hot(batch.ids[..., 0].clamp(min=0), 32).float()
+    for layers in ("recorded", "none"):
+        torch.manual_seed(4)
+        options = ControlOptions(finer_layers=layers, masks="trajectory")
+        recipe = ControlRecipe(ControlBranchConfig.tiny(), base, decoder, *samplers, options=options)
+        recipe.model.forward = lambda *_: certain
+        torch.manual_seed(5)
+        losses[layers] = recipe._losses(batch)["consistency"].item()
+        torch.manual_seed(5)
+        corrupt_tokens(batch.ids[..., 0], batch.valid, codebook_size=32, mask_id=32, pad_id=33)
+        mask = sample_masks("trajectory", batch.frames, joints=22, among=HUMANML3D.control_joints)
+        ids = batch.ids.clone()
+        ids[..., 1:] = ids[..., 1:] if layers == "recorded" else -1
+        made = decoder(decoder.tokenizer.quantizer.lookup(ids) * batch.valid[..., None], batch.frames)
+        targets = recover_joints(decoder.normalizer.denormalize(batch.features), joints=22)
+        expected = masked_consistency_loss(made, targets, mask, norm="l1").item()
+        assert losses[layers] == pytest.approx(expected, rel=1e-5)
+    assert losses["recorded"] != pytest.approx(losses["none"], rel=1e-3)
 
 
 def test_the_norm_of_the_consistency_loss_can_be_chosen(decoder, samplers, base):

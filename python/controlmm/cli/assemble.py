@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
 
 if TYPE_CHECKING:
-    from controlmm.models.length_estimator import LengthEstimator
+    from controlmm.nn.checkpoint import PretrainedModel
     from controlmm.pipelines.pipeline import MotionPipeline
     from controlmm.text import TextEncoder
+
+_Network = TypeVar("_Network", bound="PretrainedModel")
 
 
 def assemble(
@@ -45,7 +47,9 @@ def assemble(
 def _controlmm(root: Path, encoder: TextEncoder) -> tuple[MotionPipeline[Any], dict[str, str]]:
     """The pipeline, and the stage that each network's folder comes from."""
     from controlmm.models.control_branch import ControlBranch
+    from controlmm.models.length_estimator import LengthEstimator
     from controlmm.models.masked_transformer import MaskedTransformer
+    from controlmm.models.residual_control import ResidualControl
     from controlmm.models.residual_transformer import ResidualTransformer
     from controlmm.pipelines import ControlMM
     from controlmm.training.stage import load_tokenizer, tokenizer_stage
@@ -56,21 +60,24 @@ def _controlmm(root: Path, encoder: TextEncoder) -> tuple[MotionPipeline[Any], d
         transformer=MaskedTransformer.from_pretrained(_best(root, "masked")),
         residual=ResidualTransformer.from_pretrained(_best(root, "residual")),
         control=ControlBranch.from_pretrained(_best(root, "control")),
+        residual_control=_optional(ResidualControl, root, "residual-control"),
         normalizer=normalizer,
         text_encoder=encoder,
-        length=_length(root),
+        length=_optional(LengthEstimator, root, "length"),
     )
     stages = {
         "tokenizer": tokenizer_stage(root),
         "transformer": "masked",
         "residual": "residual",
         "control": "control",
+        "residual_control": "residual-control",
         "length": "length",
     }
     return pipeline, stages
 
 
 def _tlcontrol(root: Path, encoder: TextEncoder) -> tuple[MotionPipeline[Any], dict[str, str]]:
+    from controlmm.models.length_estimator import LengthEstimator
     from controlmm.models.part_vq_vae import PartVqVae
     from controlmm.models.trajectory_transformer import TrajectoryTransformer
     from controlmm.motion.normalizer import Normalizer
@@ -82,15 +89,13 @@ def _tlcontrol(root: Path, encoder: TextEncoder) -> tuple[MotionPipeline[Any], d
         transformer=TrajectoryTransformer.from_pretrained(_best(root, "tl-mtt")),
         normalizer=Normalizer.load(root / NORMALIZER_FILE),
         text_encoder=encoder,
-        length=_length(root),
+        length=_optional(LengthEstimator, root, "length"),
     )
     return pipeline, {"tokenizer": "tl-vq", "transformer": "tl-mtt", "length": "length"}
 
 
-def _length(root: Path) -> LengthEstimator | None:
-    from controlmm.models.length_estimator import LengthEstimator
-
-    return LengthEstimator.from_pretrained(_best(root, "length")) if (root / "length").is_dir() else None
+def _optional(network: type[_Network], root: Path, stage: str) -> _Network | None:
+    return network.from_pretrained(_best(root, stage)) if (root / stage).is_dir() else None
 
 
 def _best(root: Path, stage: str) -> Path:

@@ -81,12 +81,16 @@ class Study:
 
 
 def without_control_model(pipeline: ControlMM) -> ControlMM:
-    """The pipeline with a fresh motion control model, which changes nothing: its last layers are zero."""
+    """The pipeline with a fresh motion control model, which changes nothing: its last layers are zero.
+
+    Its residual layers do not see the targets either.
+    """
     plain = copy.copy(pipeline)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)  # equal in every run, though what is drawn has no effect
         fresh = ControlBranch.beside(pipeline.transformer, pipeline.control.config)
     plain.control = fresh.eval().requires_grad_(False)
+    plain.residual_control = None
     return plain
 
 

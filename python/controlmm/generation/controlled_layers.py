@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from controlmm.generation.kept_tokens import KeptTokens
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.models.residual_control import ResidualControl
 
@@ -21,11 +22,14 @@ class ControlledLayers:
     targets: Float[Tensor, "B T J 3"]  # global, in the skeleton's unit
     mask: Bool[Tensor, "B T J 3"]
     base: Float[Tensor, "B L C"]  # latents of the base layer, which may be a mean of codes
+    kept: KeptTokens | None = None  # of a motion that is there
 
     def hints(
         self, ids: Int[Tensor, "B L Q"], layer: Int[Tensor, "B"], valid: Bool[Tensor, "B L"]
     ) -> list[Float[Tensor, "B L W"]]:
         """For the residual transformer that predicts ``layer``; ``ids`` are -1 in layers that are to come."""
+        if self.kept is not None:
+            ids = self.kept.put_back(ids)
         finer = self.decoder.tokenizer.quantizer.lookup(without_base(ids))
         frames = valid.repeat_interleave(self.decoder.downsample, dim=1)
         current = self.decoder(self.base + finer, frames)

@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from controlmm.generation.controlled_layers import ControlledLayers
 from controlmm.generation.decoding_rules import DecodingRules, likeliest_share
 from controlmm.generation.editing import EditingBudget, edit_logits
-from controlmm.generation.controlled_layers import ControlledLayers
 from controlmm.generation.kept_tokens import KeptTokens
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.noise import ClipNoise

@@ -14,7 +14,7 @@ from controlmm.models.masked_transformer import MaskedTransformer, MaskedTransfo
 from controlmm.motion.skeleton import Skeleton
 from controlmm.nn.checkpoint import PretrainedModel
 from controlmm.nn.conv import ConvEncoder
-from controlmm.nn.trunk import encoder_layers
+from controlmm.nn.trunk import encoder_layers, zero_linear
 
 _EncoderKind = Literal["convolution", "projection"]
 
@@ -107,7 +107,7 @@ class ControlBranch(PretrainedModel):
     def __init__(self, config: ControlBranchConfig) -> None:
         super().__init__(config)
         self.encoder = _signal_encoder(config)
-        self.first_zero = _zero_linear(config.width)
+        self.first_zero = zero_linear(config.width, config.width)
         self.layers = encoder_layers(
             config.layers,
             width=config.width,
@@ -115,7 +115,7 @@ class ControlBranch(PretrainedModel):
             feedforward=config.feedforward,
             dropout=config.dropout,
         )
-        self.mid_zeros = nn.ModuleList(_zero_linear(config.width) for _ in range(config.layers))
+        self.mid_zeros = nn.ModuleList(zero_linear(config.width, config.width) for _ in range(config.layers))
 
     @classmethod
     def beside(cls, base: MaskedTransformer, config: ControlBranchConfig) -> ControlBranch:
@@ -197,10 +197,3 @@ def _signal_encoder(config: ControlBranchConfig) -> nn.Module:
         downsample=config.downsample,
         dropout=config.dropout,
     )
-
-
-def _zero_linear(width: int) -> nn.Linear:
-    linear = nn.Linear(width, width)
-    nn.init.zeros_(linear.weight)
-    nn.init.zeros_(linear.bias)
-    return linear

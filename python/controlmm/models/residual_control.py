@@ -13,6 +13,7 @@ from controlmm.models.residual_transformer import ResidualTransformerConfig
 from controlmm.motion.skeleton import Skeleton, skeleton_of_joints
 from controlmm.nn.checkpoint import PretrainedModel
 from controlmm.nn.conv import ConvEncoder
+from controlmm.nn.trunk import zero_linear
 
 
 @dataclass(frozen=True)
@@ -92,11 +93,8 @@ class ResidualControl(PretrainedModel):
         )
         self.factors = nn.Parameter(torch.ones(config.num_quantizers - 1, config.encoder_width))
         self.zeros = nn.ModuleList(
-            nn.Linear(config.encoder_width, config.width) for _ in range(config.layers + 1)
+            zero_linear(config.encoder_width, config.width) for _ in range(config.layers + 1)
         )
-        for linear in self.zeros:
-            nn.init.zeros_(linear.weight)
-            nn.init.zeros_(linear.bias)
 
     def signal(
         self,

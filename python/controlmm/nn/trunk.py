@@ -63,6 +63,14 @@ def output_head(width: int, out_dim: int) -> nn.Sequential:
     )
 
 
+def zero_linear(in_dim: int, out_dim: int) -> nn.Linear:
+    """A linear layer that puts out zeros until it is trained (ControlNet)."""
+    linear = nn.Linear(in_dim, out_dim)
+    nn.init.zeros_(linear.weight)
+    nn.init.zeros_(linear.bias)
+    return linear
+
+
 def initialize_weights(module: nn.Module) -> None:
     """Normal(0, 0.02) linear and embedding weights, zero biases; attention keeps its Xavier in-projection."""
     if isinstance(module, nn.Linear | nn.Embedding):

@@ -15,6 +15,7 @@ from controlmm.models.control_branch import ControlBranchConfig
 from controlmm.models.length_estimator import LengthEstimatorConfig
 from controlmm.models.masked_transformer import MaskedTransformerConfig
 from controlmm.models.part_vq_vae import PartVqVaeConfig
+from controlmm.models.residual_control import ResidualControlConfig
 from controlmm.models.residual_transformer import ResidualTransformerConfig
 from controlmm.models.rvq_vae import RvqVaeConfig
 from controlmm.models.trajectory_transformer import TrajectoryTransformerConfig
@@ -104,6 +105,7 @@ def check_sizes(
     transformer: MaskedTransformerConfig,
     residual: ResidualTransformerConfig,
     control: ControlBranchConfig,
+    residual_control: ResidualControlConfig | None = None,
     skeleton: Skeleton,
     text_dim: int,
     length: LengthEstimatorConfig | None = None,
@@ -115,17 +117,27 @@ def check_sizes(
         ("codebook_size", "residual", tokenizer.codebook_size, residual.codebook_size),
         ("num_quantizers", "residual", tokenizer.num_quantizers, residual.num_quantizers),
         ("downsample", "control", tokenizer.downsample, control.downsample),
+        (
+            "downsample",
+            "residual_control",
+            tokenizer.downsample,
+            tokenizer.downsample if residual_control is None else residual_control.downsample,
+        ),
         ("text_dim", "transformer", text_dim, transformer.text_dim),
         ("text_dim", "residual", text_dim, residual.text_dim),
         ("text_dim", "length", text_dim, text_dim if length is None else length.text_dim),
     ):
         if wanted != found:
             raise ValueError(f"The parts do not fit: `{name}` of `{part}` must be {wanted}, got {found}.")
-    if max(control.joints) >= skeleton.num_joints:
-        raise ValueError(
-            f"`joints` of `control` must be below {skeleton.num_joints} for the {skeleton.name} skeleton, "
-            f"got {max(control.joints)}."
-        )
+    for name, joints in (
+        ("control", control.joints),
+        ("residual_control", () if residual_control is None else residual_control.joints),
+    ):
+        if max(joints, default=0) >= skeleton.num_joints:
+            raise ValueError(
+                f"`joints` of `{name}` must be below {skeleton.num_joints} for the {skeleton.name} skeleton, "
+                f"got {max(joints)}."
+            )
 
 
 def check_tlcontrol_sizes(

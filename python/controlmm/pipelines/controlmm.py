@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from controlmm.controls import Avoid, Control, Objective, Obstacle
+from controlmm.generation.controlled_layers import ControlledLayers
 from controlmm.generation.latent_editing import edit_latents
 from controlmm.generation.masked_decoding import (
     DecodingRequest,
@@ -30,6 +31,7 @@ from controlmm.generation.terms import JointTerm
 from controlmm.models.control_branch import ControlBranch
 from controlmm.models.length_estimator import LengthEstimator
 from controlmm.models.masked_transformer import MaskedTransformer
+from controlmm.models.residual_control import ResidualControl
 from controlmm.models.residual_transformer import ResidualTransformer
 from controlmm.models.rvq_vae import RvqVae, frame_mask
 from controlmm.motion.motion import Motion
@@ -59,6 +61,7 @@ class ControlMM(MotionPipeline[Preset]):
         "transformer": MaskedTransformer,
         "residual": ResidualTransformer,
         "control": ControlBranch,
+        "residual_control": ResidualControl,
         "length": LengthEstimator,
     }
 
@@ -71,14 +74,18 @@ class ControlMM(MotionPipeline[Preset]):
         control: ControlBranch,
         normalizer: Normalizer,
         text_encoder: TextEncoder,
+        residual_control: ResidualControl | None = None,
         length: LengthEstimator | None = None,
     ) -> None:
         control.config.check_base(transformer.config)
+        if residual_control is not None:
+            residual_control.config.check_base(residual.config)
         check_sizes(
             tokenizer=tokenizer.config,
             transformer=transformer.config,
             residual=residual.config,
             control=control.config,
+            residual_control=None if residual_control is None else residual_control.config,
             skeleton=normalizer.skeleton,
             text_dim=text_encoder.dim,
             length=None if length is None else length.config,
@@ -88,6 +95,9 @@ class ControlMM(MotionPipeline[Preset]):
         self.transformer = transformer.eval().requires_grad_(False)
         self.residual = residual.eval().requires_grad_(False)
         self.control = control.eval().requires_grad_(False)
+        self.residual_control = (
+            None if residual_control is None else residual_control.eval().requires_grad_(False)
+        )
         self.decoder = MotionDecoder(tokenizer, normalizer)
         self.text_encoder = text_encoder
 
@@ -280,10 +290,16 @@ class ControlMM(MotionPipeline[Preset]):
         base_ids = decode_from_text(self.transformer, request)
         return self.decoder.tokenizer.quantizer.lookup(self._filled(base_ids, request, preset))
 
-    def _filled(self, base_ids: Tensor, request: DecodingRequest, preset: Preset) -> Tensor:
+    def _filled(
+        self,
+        base_ids: Tensor,
+        request: DecodingRequest,
+        preset: Preset,
+        control: ControlledLayers | None = None,
+    ) -> Tensor:
         """All layers of codes: those of tokens that are kept, the others from the residual transformer."""
         scale = preset.residual_guidance_scale
-        ids = fill_residual_layers(self.residual, base_ids, request, guidance_scale=scale)
+        ids = fill_residual_layers(self.residual, base_ids, request, guidance_scale=scale, control=control)
         return ids if request.kept is None else request.kept.put_back(ids)
 
     def refined_latents(
@@ -332,7 +348,14 @@ class ControlMM(MotionPipeline[Preset]):
             request,
             budget=preset.budget,
         )
-        ids = self._filled(final_base_ids(logits, request), request, preset)
+        base_ids = final_base_ids(logits, request)
+        control = None
+        if branch is not None and self.residual_control is not None:
+            base = final_latents(self.decoder.tokenizer, logits, base_ids[..., None], request)
+            control = ControlledLayers(
+                self.residual_control, self.decoder, objective.targets, objective.mask, base, request.kept
+            )
+        ids = self._filled(base_ids, request, preset, control)
         return final_latents(self.decoder.tokenizer, logits, ids, request)
 
 

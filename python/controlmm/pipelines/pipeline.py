@@ -45,7 +45,7 @@ class MotionPipeline(ABC, Generic[_Plan]):
     kind: ClassVar[str]  # in pipeline.json, and the name of the model that comes with the package
     # By the names of their folders, which are those of the constructor's arguments and of attributes.
     network_classes: ClassVar[Mapping[str, type[PretrainedModel]]]
-    optional_networks: ClassVar[tuple[str, ...]] = ("length",)
+    optional_networks: ClassVar[tuple[str, ...]] = ("length", "residual_control")
     decoder: MotionDecoder
     text_encoder: TextEncoder
     length: LengthEstimator | None = None  # draws the length of motions whose caller does not say

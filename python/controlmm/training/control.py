@@ -49,7 +49,7 @@ class ControlOptions:
     drops_text: bool = True  # as the paper; the published code never does
     share_of: int | None = None  # as in `MaskedOptions`
     # Residual codes in the motion that the consistency loss sees; published: none. Base codes alone miss even
-    # their own recording's path by far, so without the finer layers this loss pulls against the cross-entropy.
+    # their own recording's path by far, so without finer layers this loss pulls against the cross-entropy.
     finer_layers: FinerLayers = "recorded"
 
     def __post_init__(self) -> None:

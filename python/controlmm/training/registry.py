@@ -27,7 +27,7 @@ MODULES = {
     "tl-mtt": "tl_mtt",
     "tl-unsplit": "tl_unsplit",
 }
-CONTROLMM_STAGES = ("rvq", "masked", "residual", "control")  # that `controlmm assemble` puts together
+CONTROLMM_STAGES = ("rvq", "masked", "residual", "control", "residual-control")  # of a whole model
 TLCONTROL_STAGES = ("tl-vq", "tl-mtt")
 
 

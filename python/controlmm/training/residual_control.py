@@ -16,6 +16,7 @@ from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.models.masked_transformer import MaskedTransformer
 from controlmm.models.residual_control import ResidualControl, ResidualControlConfig
 from controlmm.models.residual_transformer import ResidualTransformer
+from controlmm.nn.quantizer import ResidualQuantizer
 from controlmm.nn.trunk import drop_text
 from controlmm.ops import masked_consistency_loss, recover_joints
 from controlmm.training import masked
@@ -23,6 +24,7 @@ from controlmm.training.control_masks import MaskMode, sample_masks
 from controlmm.training.corruption import corrupt_tokens
 from controlmm.training.recipe import Recipe
 from controlmm.training.residual import random_layers
+from controlmm.training.samples import clips_with_controlled_layers
 from controlmm.training.stage import Stage, StageInputs, best_weights, by_size, load_tokenizer
 from controlmm.training.tokens import TokenBatch, TokenSampler
 
@@ -194,7 +196,9 @@ class ResidualControlRecipe:
 
     def _chosen(self, logits: Float[Tensor, "B L K"], layer: int) -> Float[Tensor, "B L C"]:
         """The likeliest codes, as in decoding, with the gradient of the mean code."""
-        codes = self.decoder.tokenizer.quantizer.book(layer).codes
+        quantizer = self.decoder.tokenizer.quantizer
+        assert isinstance(quantizer, ResidualQuantizer)  # the only kind with layers
+        codes = quantizer.book(layer).codes
         mean = logits.softmax(-1) @ codes
         return mean + (codes[logits.argmax(-1)] - mean).detach()
 
@@ -233,4 +237,5 @@ STAGE = Stage(
     ("rvq", "masked", "residual"),
     network="residual_control",
     options=ResidualControlOptions(),
+    samples=clips_with_controlled_layers,
 )

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from controlmm.data.clip import FeatureClip
+from controlmm.generation.controlled_layers import ControlledLayers
 from controlmm.generation.editing import EditingBudget
 from controlmm.generation.masked_decoding import (
     DecodingRequest,
@@ -24,6 +25,7 @@ from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.noise import ClipNoise, clip_seeds
 from controlmm.generation.objective import ControlObjective
 from controlmm.models.masked_transformer import MaskedTransformer
+from controlmm.models.residual_transformer import ResidualTransformer
 from controlmm.models.rvq_vae import frame_mask
 from controlmm.motion.normalizer import Normalizer
 from controlmm.ops import recover_joints
@@ -94,12 +96,33 @@ def clips_with_control(recipe: Recipe, inputs: StageInputs) -> Sequence[Sample]:
     shown = _shown(inputs, decoder)
     request = _request(shown, decoder, inputs)
     recorded = _recorded(decoder, shown)
-    mask = torch.zeros(recorded.shape, dtype=torch.bool)
-    mask[..., _PELVIS, :] = shown.frames[..., None]
-    objective = ControlObjective(decoder, recorded, mask, shown.frames)
+    objective = ControlObjective(decoder, recorded, _pelvis_path(recorded, shown), shown.frames)
     logits = decode_with_control(base, _on_cpu(recipe.model), decoder, objective, request, budget=_NO_EDITING)
     latents = logits.softmax(-1) @ decoder.tokenizer.base_codes * request.valid[..., None]
     return shown.samples(recorded, decoder(latents, shown.frames), " (text and path, base codes)")
+
+
+def clips_with_controlled_layers(recipe: Recipe, inputs: StageInputs) -> Sequence[Sample]:
+    """The clips' own base codes and their pelvis paths, with the finer layers that follow them."""
+    decoder = MotionDecoder(*load_tokenizer(inputs.root))
+    residual = ResidualTransformer.from_pretrained(best_weights(inputs.root, "residual"))
+    shown = _shown(inputs, decoder)
+    request = _request(shown, decoder, inputs)
+    base_ids = decoder.tokenizer.encode(shown.features, shown.frames)[..., 0]
+    base = decoder.base_latents(base_ids, request.valid)
+    recorded = _recorded(decoder, shown)
+    control = ControlledLayers(_on_cpu(recipe.model), decoder, recorded, _pelvis_path(recorded, shown), base)
+    ids = fill_residual_layers(residual, base_ids, request, control=control)
+    latents = decoder.tokenizer.quantizer.lookup(ids)
+    note = " (own base codes and path, finer layers made)"
+    return shown.samples(recorded, decoder(latents, shown.frames), note)
+
+
+def _pelvis_path(recorded: Float[Tensor, "B T J 3"], shown: _Shown) -> Bool[Tensor, "B T J 3"]:
+    """Which coordinates are given: the pelvis in all frames."""
+    mask = torch.zeros(recorded.shape, dtype=torch.bool)
+    mask[..., _PELVIS, :] = shown.frames[..., None]
+    return mask
 
 
 def _on_cpu(network: Any) -> Any:
