@@ -78,20 +78,24 @@ def _controlmm(root: Path, encoder: TextEncoder) -> tuple[MotionPipeline[Any], d
 
 def _tlcontrol(root: Path, encoder: TextEncoder) -> tuple[MotionPipeline[Any], dict[str, str]]:
     from controlmm.models.length_estimator import LengthEstimator
-    from controlmm.models.part_vq_vae import PartVqVae
     from controlmm.models.trajectory_transformer import TrajectoryTransformer
-    from controlmm.motion.normalizer import Normalizer
     from controlmm.pipelines import TLControl
-    from controlmm.training.stage import NORMALIZER_FILE
+    from controlmm.training.stage import load_part_tokenizer, tokenizer_stage
 
+    tokenizer, normalizer = load_part_tokenizer(root)
     pipeline = TLControl(
-        tokenizer=PartVqVae.from_pretrained(_best(root, "tl-vq")),
+        tokenizer=tokenizer,
         transformer=TrajectoryTransformer.from_pretrained(_best(root, "tl-mtt")),
-        normalizer=Normalizer.load(root / NORMALIZER_FILE),
+        normalizer=normalizer,
         text_encoder=encoder,
         length=_optional(LengthEstimator, root, "length"),
     )
-    return pipeline, {"tokenizer": "tl-vq", "transformer": "tl-mtt", "length": "length"}
+    stages = {
+        "tokenizer": tokenizer_stage(root, "tl-vq"),
+        "transformer": "tl-mtt",
+        "length": "length",
+    }
+    return pipeline, stages
 
 
 def _optional(network: type[_Network], root: Path, stage: str) -> _Network | None:

@@ -24,6 +24,7 @@ MODULES = {
     "length": "length",
     "evaluator": "evaluator",
     "tl-vq": "tl_vq",
+    "tl-decoder": "tl_decoder",
     "tl-mtt": "tl_mtt",
     "tl-unsplit": "tl_unsplit",
 }

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -14,6 +14,7 @@ from torch import Tensor
 
 from controlmm.data.clip import FeatureClip
 from controlmm.data.folder import MotionFolder
+from controlmm.models.part_vq_vae import PartVqVae
 from controlmm.models.rvq_vae import RvqVae
 from controlmm.models.tokenizer import MotionTokenizer
 from controlmm.motion.normalizer import ROOT_CONTACT_BIAS, Normalizer
@@ -26,7 +27,9 @@ from controlmm.training.tokens import MIN_FRAMES, TokenSampler
 
 NORMALIZER_FILE = "normalizer.safetensors"
 SIZES = ("small", "paper", "tiny")
+_REFINERS = {"rvq": "rvq-decoder", "tl-vq": "tl-decoder"}  # of the tokenizers' decoders
 _MIN_FRAMES_KIT = 24  # KIT-ML's clips are at 12.5 fps, so its shortest are shorter
+_Tokenizer = TypeVar("_Tokenizer", bound=MotionTokenizer)
 
 
 @dataclass(frozen=True)
@@ -149,25 +152,41 @@ def load_tokenizer(root: str | Path) -> tuple[RvqVae, Normalizer]:
         FileNotFoundError: If the stage ``rvq`` is not trained yet.
         ValueError: If the refined decoder belongs to another tokenizer.
     """
-    root = Path(root)
-    tokenizer = RvqVae.from_pretrained(best_weights(root, "rvq"))
+    return _load(RvqVae, "rvq", Path(root))
+
+
+def load_part_tokenizer(root: str | Path) -> tuple[PartVqVae, Normalizer]:
+    """As :func:`load_tokenizer`, of TLControl: the stage ``tl-vq``, refined by ``tl-decoder``."""
+    return _load(PartVqVae, "tl-vq", Path(root))
+
+
+def _load(network: type[_Tokenizer], stage: str, root: Path) -> tuple[_Tokenizer, Normalizer]:
+    tokenizer = network.from_pretrained(best_weights(root, stage))
     normalizer = Normalizer.load(root / NORMALIZER_FILE)
-    if tokenizer_stage(root) == "rvq":
+    refiner = tokenizer_stage(root, stage)
+    if refiner == stage:
         return tokenizer, normalizer
-    refined = RvqVae.from_pretrained(best_weights(root, "rvq-decoder"))
+    refined = network.from_pretrained(best_weights(root, refiner))
     if not have_same_codes(refined, tokenizer):
         raise ValueError(
-            f"{root / 'rvq-decoder'} refines another tokenizer than {root / 'rvq'}. "
-            "Remove it, or train it again."
+            f"{root / refiner} refines another tokenizer than {root / stage}. Remove it, or train it again."
         )
     return refined, normalizer
 
 
-def have_same_codes(first: RvqVae, second: RvqVae) -> bool:
+def have_same_codes(first: MotionTokenizer, second: MotionTokenizer) -> bool:
     """Whether a token means the same to both tokenizers."""
-    return first.config == second.config and torch.equal(first.base_codes, second.base_codes)
+    return first.config == second.config and all(
+        torch.equal(code, other) for code, other in zip(_codes(first), _codes(second), strict=True)
+    )
 
 
-def tokenizer_stage(root: Path) -> str:
-    """The stage that the tokenizer of ``root`` comes from: ``rvq``, or ``rvq-decoder`` that refined it."""
-    return "rvq-decoder" if (root / "rvq-decoder" / "best").is_dir() else "rvq"
+def _codes(tokenizer: MotionTokenizer) -> list[Tensor]:
+    state = tokenizer.quantizer.state_dict()
+    return [state[name] for name in state if name.rpartition(".")[2] not in tokenizer.training_state]
+
+
+def tokenizer_stage(root: Path, stage: str = "rvq") -> str:
+    """The stage that the tokenizer of ``root`` comes from: ``stage``, or the one that refined its decoder."""
+    refiner = _REFINERS[stage]
+    return refiner if (root / refiner / "best").is_dir() else stage

@@ -22,7 +22,7 @@ from controlmm.ops import gumbel_straight_through, recover_joints
 from controlmm.training import masked
 from controlmm.training.recipe import Recipe
 from controlmm.training.settings import TrainingSettings
-from controlmm.training.stage import NORMALIZER_FILE, Stage, StageInputs, best_weights, by_size
+from controlmm.training.stage import Stage, StageInputs, by_size, load_part_tokenizer
 from controlmm.training.tokens import TokenBatch, TokenSampler
 from controlmm.training.trajectory_masks import Masking, given_coordinates
 
@@ -199,8 +199,7 @@ def _clip_cross_entropy(logits: Float[Tensor, "B L P K"], ids: Int[Tensor, "B L 
 
 def _build(config: TrajectoryTransformerConfig, inputs: StageInputs) -> Recipe:
     assert inputs.text_encoder is not None  # the stage uses text
-    tokenizer = PartVqVae.from_pretrained(best_weights(inputs.root, "tl-vq"))
-    normalizer = Normalizer.load(inputs.root / NORMALIZER_FILE)
+    tokenizer, normalizer = load_part_tokenizer(inputs.root)
     config = config.for_text(inputs.text_encoder.dim).for_skeleton(normalizer.skeleton)
     recipe = TrajectoryRecipe(
         config, tokenizer, normalizer, *inputs.token_samplers(tokenizer), options=inputs.options

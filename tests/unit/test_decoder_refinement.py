@@ -6,7 +6,7 @@ import torch
 from controlmm.data.clip import FeatureClip
 from controlmm.models.rvq_vae import RvqVae, RvqVaeConfig
 from controlmm.motion.normalizer import Normalizer
-from controlmm.training.rvq_decoder import RvqDecoderOptions, RvqDecoderRecipe
+from controlmm.training.decoder_refinement import DecoderOptions, DecoderRecipe
 
 _FRAMES = 12
 
@@ -16,7 +16,9 @@ def recipe():
     torch.manual_seed(0)
     clip = FeatureClip("a", torch.randn(_FRAMES, 263), ())
     normalizer = Normalizer.fit([clip.features])
-    return RvqDecoderRecipe(RvqVae(RvqVaeConfig.tiny()), normalizer, [clip], [clip], progress=False)
+    return DecoderRecipe(
+        RvqVae(RvqVaeConfig.tiny()), normalizer, [clip], [clip], stage="rvq-decoder", progress=False
+    )
 
 
 def _losses(recipe, change):
@@ -57,4 +59,4 @@ def test_a_body_of_twice_the_size_has_bones_that_are_too_long(recipe):
 
 def test_weights_must_not_be_negative():
     with pytest.raises(ValueError, match="`bone_weight` must not be negative, got -1"):
-        RvqDecoderOptions(bone_weight=-1)
+        DecoderOptions(bone_weight=-1)
