@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -31,7 +32,9 @@ def bench(tiny_pipeline, tiny_data_folder, tiny_evaluator_folder, monkeypatch):
     }
     monkeypatch.setattr(editing_rows, "PLANS", quick)
     test_set = read_test_set(tiny_data_folder, split="val")
-    return Bench(tiny_pipeline, load_evaluator(tiny_evaluator_folder), test_set, Protocol(limit=2))
+    return Bench(
+        tiny_pipeline, load_evaluator(tiny_evaluator_folder), test_set, Protocol(limit=2), slow_limit=1
+    )
 
 
 @torch.no_grad()
@@ -46,6 +49,15 @@ def test_editing_lowers_the_error_and_counts_its_work(bench):
         assert rows[solver]["seconds"] > 0
     assert rows["exact"]["worst_cm"] < 0.01
     assert rows["paper-accurate"]["evaluations"] == 2 + 21  # logits in two steps, latents with the start
+
+
+@torch.no_grad()
+def test_slow_solvers_take_fewer_clips_and_few_clips_have_no_fid(bench):
+    rows = {solver: bench.row(solver, ControlSetting("pelvis", 1)) for solver in ("exact", "paper-accurate")}
+    assert (rows["exact"]["clips"], rows["paper-accurate"]["clips"]) == (2, 1)
+    text = editing.table([{**row, "key": f"{solver}/pelvis/1"} for solver, row in rows.items()])
+    assert math.isnan(rows["exact"]["fid"])
+    assert "nan" not in text
 
 
 def test_what_takes_hours_comes_last():

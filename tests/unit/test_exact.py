@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 import torch
@@ -22,6 +23,8 @@ from controlmm.generation.exact.projection import (
 from controlmm.generation.exact.refit import refit_features
 from controlmm.generation.exact.smooth_bones import solve_chain
 from controlmm.motion.features import bone_lengths, canonicalize, joints_to_features
+from controlmm.motion.layout import feature_layout
+from controlmm.motion.rotations import matrix_to_rot6d, quat_to_matrix, rot6d_to_matrix
 from controlmm.motion.skeleton import HUMANML3D
 from controlmm.ops import recover_joints
 from controlmm.pipelines import PRESETS
@@ -135,6 +138,39 @@ def test_features_of_joints_that_did_not_move_stay(features):
     """Rotations and velocities are those that the feature code computes, heading and contacts untouched."""
     fitted = refit_features(features, joints_of(features), HUMANML3D)
     torch.testing.assert_close(fitted, features, rtol=0, atol=2e-4)  # rotations: float32 quaternions
+
+
+def test_rotations_turn_with_the_bones(features):
+    """Forward kinematics of the fitted rotations points every bone as the moved joints do."""
+    moved = joints_of(features) + 0.05 * random(40, 22, 3, seed=2)
+    moved[0, 0, [0, 2]] = 0
+    fitted = refit_features(features, moved, HUMANML3D).double()
+    layout = feature_layout(HUMANML3D)
+    half_turn = torch.cat([torch.zeros(1), fitted[:-1, layout.root_yaw_velocity].flatten().cumsum(0)])
+    zero = torch.zeros_like(half_turn)
+    current = torch.stack([half_turn.cos(), zero, half_turn.sin(), zero], dim=-1).double()
+    local = rot6d_to_matrix(fitted[:, layout.local_rotations].unflatten(1, (21, 6)))
+    rest = HUMANML3D.rest_offsets().double()
+    for chain in HUMANML3D.chains:
+        turned = quat_to_matrix(current)
+        for parent, child in pairwise(chain):
+            turned = turned @ local[:, child - 1]
+            bone = moved[:, child] - moved[:, parent]
+            expected = bone / bone.norm(dim=-1, keepdim=True) * LENGTHS[child]
+            torch.testing.assert_close(turned @ rest[child], expected, rtol=0, atol=1e-4)
+
+
+def test_rotations_that_a_decoder_bent_are_turned_by_no_more_than_the_bones(features):
+    """What the network made of rotations stays where joints stay."""
+    layout = feature_layout(HUMANML3D)
+    made, joints = features.clone(), joints_of(features)
+    angles = made[:, layout.local_rotations].unflatten(1, (21, 6))
+    angles[:] = matrix_to_rot6d(rot6d_to_matrix(angles + 0.2 * random(40, 21, 6, seed=4).float()))
+    joints[:, 20] += torch.tensor([0.0, 0.1, 0.0])
+    fitted = refit_features(made, joints, HUMANML3D)[:, layout.local_rotations].unflatten(1, (21, 6))
+    others = [joint - 1 for joint in range(1, 22) if joint != 20]
+    torch.testing.assert_close(fitted[:, others], angles[:, others], rtol=0, atol=1e-5)
+    assert (fitted[:, 19] - angles[:, 19]).abs().amax() > 0.1
 
 
 @pytest.fixture

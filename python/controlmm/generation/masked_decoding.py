@@ -123,7 +123,8 @@ def decode_with_control(
         else:
             latents = torch.where(hidden, mean_code, logits.softmax(-1) @ codes) * keep
             signal = branch.signal(objective.targets, objective.mask, decoder(latents, frames))
-            logits = guided(partial(_controlled_logits, base, branch, embedded, signal, valid), request)
+            hint = branch.hint(signal, valid)
+            logits = guided(partial(_controlled_logits, base, branch, embedded, hint, valid), request)
         if kept is not None:
             logits = kept.certain(logits)
         if budget.logits_iterations:
@@ -152,12 +153,11 @@ def _controlled_logits(
     base: MaskedTransformer,
     branch: ControlBranch,
     embedded: Float[Tensor, "B L E"],
-    signal: Float[Tensor, "B T S"],
+    hint: Float[Tensor, "B S W"],
     valid: Bool[Tensor, "B L"],
     text: Float[Tensor, "B D"],
 ) -> Float[Tensor, "B L K"]:
-    logits: Tensor = branch(base, base.sequence(embedded, text), signal, valid)
-    return logits
+    return branch.hinted_logits(base, base.sequence(embedded, text), hint, valid)
 
 
 def fill_residual_layers(

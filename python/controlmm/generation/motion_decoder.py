@@ -32,7 +32,7 @@ class MotionDecoder(nn.Module):
         self._packed_version: tuple[int, ...] = ()
         self._frozen: dict[torch.dtype, FrozenDecoder] = {}
         self._spread: tuple[tuple[int, ...], CodeSpread] | None = None
-        self._sensitivities: dict[tuple[int, ...], Sensitivity] = {}
+        self._sensitivities: dict[int, Sensitivity] = {}  # of each channel
         self._grams: dict[tuple[int, ...], Tensor] = {}
 
     def frozen(self, dtype: torch.dtype = torch.float32) -> FrozenDecoder:
@@ -51,20 +51,23 @@ class MotionDecoder(nn.Module):
     def channel_gram(self, channels: tuple[int, ...], tokens: int) -> Float[Tensor, "D T D T"]:
         """Products of the rows of the decoder's Jacobian, in the unit of :meth:`spread`; see ``sensitivity``.
 
-        Made at the first call for some channels (a fraction of a second), remembered for a few choices. A
-        shorter clip takes a part of what a longer one had.
+        Each channel is measured once (a fraction of a second for a joint), products are remembered for a few
+        choices. A shorter clip takes a part of what a longer one had.
         """
         frozen, spread = self.frozen(), self.spread()
-        if channels not in self._sensitivities:
-            self._sensitivities[channels] = measure_sensitivity(
-                frozen, self.typical_latents(), channels, downsample=self.downsample, spread=spread
+        unknown = [channel for channel in channels if channel not in self._sensitivities]
+        if unknown:
+            measured = measure_sensitivity(
+                frozen, self.typical_latents(), unknown, downsample=self.downsample, spread=spread
             )
+            self._sensitivities.update(zip(unknown, measured.split(), strict=True))
         frames = tokens * self.downsample
         if channels not in self._grams or self._grams[channels].shape[1] < frames:
             self._grams.pop(channels, None)
             while len(self._grams) >= _REMEMBERED:
                 self._grams.pop(next(iter(self._grams)))
-            self._grams[channels] = self._sensitivities[channels].gram(tokens)
+            own = Sensitivity.joined([self._sensitivities[channel] for channel in channels])
+            self._grams[channels] = own.gram(tokens)
         return self._grams[channels][:, :frames, :, :frames]
 
     def spread(self) -> CodeSpread:

@@ -35,21 +35,36 @@ class Sensitivity:
     mean: Float[Tensor, "D S W C"]
     scatter: Float[Tensor, "D S"]
 
+    @classmethod
+    def joined(cls, channels: Sequence[Sensitivity]) -> Sensitivity:
+        """Of all channels of several."""
+        return cls(
+            torch.cat([channel.mean for channel in channels]),
+            torch.cat([channel.scatter for channel in channels]),
+        )
+
+    def split(self) -> list[Sensitivity]:
+        """Of each channel by itself."""
+        parts = zip(self.mean.split(1), self.scatter.split(1), strict=True)
+        return [Sensitivity(mean, scatter) for mean, scatter in parts]
+
     def gram(self, tokens: int) -> Float[Tensor, "D T D T"]:
         """``G`` for a clip of ``tokens`` tokens, float64."""
         channels, step, window = self.mean.shape[:3]
         rows = self.mean.flatten(0, 1).double()  # (N, W, C) with N = D S
-        lags = torch.zeros(2 * window - 1, len(rows), len(rows), dtype=torch.float64)
+        lags = torch.zeros(2 * window, len(rows), len(rows), dtype=torch.float64)  # the last: out of sight
         for lag in range(window):  # token s sees at w what token s + lag sees at w - lag
             overlap = rows[:, lag:].flatten(1) @ rows[:, : window - lag].flatten(1).T
             lags[window - 1 + lag], lags[window - 1 - lag] = overlap, overlap.T
         token = torch.arange(tokens)
         distance = token[None, :] - token[:, None]  # (L, L)
-        is_near = distance.abs() < window
-        blocks = lags[(distance + window - 1).clamp(0, 2 * window - 2)] * is_near[..., None, None]
-        gram = blocks.reshape(tokens, tokens, channels, step, channels, step).permute(2, 0, 3, 4, 1, 5)
-        gram = gram.reshape(channels, tokens * step, channels, tokens * step).contiguous()
+        which = (distance + window - 1).where(distance.abs() < window, 2 * window - 1)
+        blocks = lags.reshape(-1, channels, step, channels, step).permute(1, 2, 3, 0, 4).contiguous()
+        split = torch.empty(channels, tokens, step, channels, tokens, step, dtype=torch.float64)
+        for row in range(tokens):  # this matrix may take 100 MB: it is written once
+            split[:, row] = blocks[:, :, :, which[row]]
         frames = tokens * step
+        gram = split.view(channels, frames, channels, frames)
         own = self.scatter.double().repeat(1, tokens).flatten()
         gram.view(channels * frames, channels * frames).diagonal().add_(own)
         return gram

@@ -158,9 +158,22 @@ class ControlBranch(PretrainedModel):
         valid: Bool[Tensor, "B L"],
     ) -> Float[Tensor, "B L K"]:
         """Logits of ``base`` under control; ``sequence`` is :meth:`MaskedTransformer.sequence`'s."""
+        return self.hinted_logits(base, sequence, self.hint(signal, valid), valid)
+
+    def hint(self, signal: Float[Tensor, "B T C"], valid: Bool[Tensor, "B L"]) -> Float[Tensor, "B S W"]:
+        """What the signal adds to the sequence, whatever the text."""
         frames = valid.repeat_interleave(self.config.downsample, dim=1)
         encoded = self.encoder(signal.transpose(1, 2), frames).transpose(1, 2)  # (B, L, W)
-        hint = torch.nn.functional.pad(self.first_zero(encoded), (0, 0, 1, 0))  # nothing for the text token
+        return torch.nn.functional.pad(self.first_zero(encoded), (0, 0, 1, 0))  # nothing for the text token
+
+    def hinted_logits(
+        self,
+        base: MaskedTransformer,
+        sequence: Float[Tensor, "B S W"],
+        hint: Float[Tensor, "B S W"],
+        valid: Bool[Tensor, "B L"],
+    ) -> Float[Tensor, "B L K"]:
+        """As :meth:`forward`, with the :meth:`hint` that predictions with and without text share."""
         hidden = sequence + hint
         padding = ~with_text_token(valid)
         residuals = []
