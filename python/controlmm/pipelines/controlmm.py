@@ -26,6 +26,7 @@ from controlmm.generation.masked_decoding import (
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.noise import ClipNoise
 from controlmm.generation.objective import ControlObjective
+from controlmm.generation.planted_feet import with_planted_feet
 from controlmm.generation.solvers import Progress
 from controlmm.generation.terms import JointTerm
 from controlmm.models.control_branch import ControlBranch
@@ -271,7 +272,11 @@ class ControlMM(MotionPipeline[Preset]):
                 continue
             request = request_for(rows)
             if branch is None and not terms:
-                latents[rows] = self._from_text(request, preset)
+                drawn = self._from_text(request, preset)
+                strength = preset.budget.naturalness
+                latents[rows] = with_planted_feet(
+                    self.decoder, drawn, request.valid, strength=strength, progress=progress
+                )
                 continue
             objective = ControlObjective(
                 self.decoder,

@@ -174,7 +174,7 @@ class MotionPipeline(ABC, Generic[_Plan]):
                 the speed of the machine.
             naturalness: How strongly editing keeps what no target leads as it was: 0 not at all, 1 as the
                 presets do (the papers' do not). Feet at rest stay, joints do not shake, and the ground stays
-                level where heights are free; 0 if a path climbs stairs.
+                level where heights are free; 0 if a path climbs stairs. Without targets only feet count.
             seed: Same seed, same motions.
             progress: Called as ``progress(phase, done, total)`` during long loops.
 
