@@ -17,6 +17,7 @@ from torch.nn.utils.rnn import pad_sequence
 from controlmm import TLControl
 from controlmm.data import FeatureClip, MotionFolder
 from controlmm.evaluation.control_errors import control_errors
+from controlmm.evaluation.machine import machine, revision
 from controlmm.generation.partial_decoder import PartialDecoder
 from controlmm.models.rvq_vae import frame_mask
 from controlmm.motion.skeleton import Skeleton
@@ -267,7 +268,7 @@ def main() -> None:
     batches = read_clips(pipeline.skeleton, arguments.data, split=arguments.split, limit=arguments.limit)
     rows = TABLES[arguments.table](pipeline, batches)
     count = sum(len(clips.lengths) for clips in batches)
-    print(f"{count} clips, {torch.get_num_threads()} threads\n\n{markdown(rows)}")
+    print(f"{count} clips of {arguments.split}, {machine()}; {revision()}\n\n{markdown(rows)}")
 
 
 def markdown(rows: Sequence[Sequence[str]]) -> str:

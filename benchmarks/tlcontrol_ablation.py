@@ -16,6 +16,7 @@ from torch import Tensor
 
 from benchmarks.tlcontrol import JOINT_SETS, Clips, markdown, read_clips
 from controlmm.evaluation.control_errors import control_errors
+from controlmm.evaluation.machine import machine, revision
 from controlmm.evaluation.published_tables import published_table
 from controlmm.generation.code_optimization import CodeOptimization, optimize_codes
 from controlmm.generation.motion_decoder import MotionDecoder
@@ -98,7 +99,7 @@ def main() -> None:
             )
     published = published_table("tl-supplement1")
     print(f"Published:\n\n{markdown([published.columns, *published.rows])}\n")
-    print(f"Ours, {count} clips, {torch.get_num_threads()} threads:\n\n{markdown(rows)}")
+    print(f"Ours, {count} clips of {arguments.split}, {machine()}; {revision()}:\n\n{markdown(rows)}")
 
 
 if __name__ == "__main__":
