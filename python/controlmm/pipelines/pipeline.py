@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
-from typing import ClassVar, Generic, Self, TypeVar
+from typing import Generic, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,23 +14,19 @@ from torch import Tensor
 
 from controlmm.controls import Avoid, Control, Objective, Obstacle, TimelineEntry
 from controlmm.generation.exact import ExactReport, meet_exactly
-from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.noise import clip_seeds
 from controlmm.generation.solvers import Progress
 from controlmm.generation.terms import JointTerm
 from controlmm.models.length_estimator import LengthEstimator
-from controlmm.motion.normalizer import Normalizer
-from controlmm.motion.skeleton import Skeleton
-from controlmm.nn.checkpoint import PretrainedModel
-from controlmm.pipelines import folder as files
 from controlmm.pipelines.chaining import run_chain
 from controlmm.pipelines.checks import check_sampling
 from controlmm.pipelines.length import draw_frames
 from controlmm.pipelines.output import GenerationResult
+from controlmm.pipelines.pretrained import PretrainedPipeline
 from controlmm.pipelines.reach import check_reach
 from controlmm.pipelines.scene import Scene
 from controlmm.pipelines.timeline import TimelineMethod, run_timeline
-from controlmm.text import TextEncoder, check_prompt, check_same_encoder, load_text_encoder
+from controlmm.text import check_prompt
 
 MAX_FRAMES = 196
 
@@ -39,15 +34,9 @@ MAX_FRAMES = 196
 _Plan = TypeVar("_Plan")  # a pipeline's kind of preset
 
 
-class MotionPipeline(ABC, Generic[_Plan]):
+class MotionPipeline(PretrainedPipeline, ABC, Generic[_Plan]):
     """Text plus 3D control in, motions out. A subclass says how the latents of a batch are made."""
 
-    kind: ClassVar[str]  # in pipeline.json, and the name of the model that comes with the package
-    # By the names of their folders, which are those of the constructor's arguments and of attributes.
-    network_classes: ClassVar[Mapping[str, type[PretrainedModel]]]
-    optional_networks: ClassVar[tuple[str, ...]] = ("length", "residual_control")
-    decoder: MotionDecoder
-    text_encoder: TextEncoder
     length: LengthEstimator | None = None  # draws the length of motions whose caller does not say
 
     @abstractmethod
@@ -93,42 +82,6 @@ class MotionPipeline(ABC, Generic[_Plan]):
             TypeError: If it is neither.
             ValueError: If there is none of that name.
         """
-
-    @classmethod
-    def from_pretrained(
-        cls, path: str | Path | None = None, *, text_encoder: TextEncoder | None = None
-    ) -> Self:
-        """Load a pipeline folder; without a path, the trained model that comes with the package.
-
-        Args:
-            path: A folder written by :meth:`save_pretrained`.
-            text_encoder: Use this one instead of loading the one that the folder names; it must equal it.
-
-        Raises:
-            FileNotFoundError: If the folder or one of its files is missing.
-            ValueError: If a file is damaged, or the text encoder is not the one used in training.
-            ModuleNotFoundError: If the text encoder's weights are not installed.
-        """
-        folder = files.resolve_folder(path, shipped=cls.kind)
-        files.check_kind(folder, cls.kind)
-        encoder_config = files.read_json(folder / files.TEXT_ENCODER_FILE)
-        if text_encoder is None:
-            text_encoder = load_text_encoder(encoder_config)
-        else:
-            check_same_encoder(encoder_config, text_encoder)
-        networks = {
-            name: network.from_pretrained(folder / name)
-            for name, network in cls.network_classes.items()
-            if name not in cls.optional_networks or (folder / name).is_dir()
-        }
-        normalizer = Normalizer.load(folder / files.NORMALIZER_FILE)
-        assembled: Callable[..., Self] = cls  # every subclass takes its networks by these names
-        return assembled(**networks, normalizer=normalizer, text_encoder=text_encoder)
-
-    def networks(self) -> dict[str, PretrainedModel]:
-        """All networks by the names of their folders."""
-        found = {name: getattr(self, name) for name in self.network_classes}
-        return {name: network for name, network in found.items() if network is not None}
 
     @torch.no_grad()
     def __call__(
@@ -384,24 +337,3 @@ class MotionPipeline(ABC, Generic[_Plan]):
             downsample=self.decoder.downsample,
             seed=seed,
         )
-
-    @property
-    def skeleton(self) -> Skeleton:
-        """The joints that motions have and controls may name."""
-        return self.decoder.normalizer.skeleton
-
-    @property
-    def num_parameters(self) -> int:
-        """Parameters of all networks, the text encoder not counted."""
-        return sum(p.numel() for network in self.networks().values() for p in network.parameters())
-
-    def save_pretrained(self, path: str | Path, *, dtype: torch.dtype = torch.float32) -> Path:
-        """Write the pipeline as a folder (safetensors and JSON); ``dtype=torch.float16`` halves it."""
-        folder = Path(path)
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, network in self.networks().items():
-            network.save_pretrained(folder / name, dtype=dtype)
-        self.decoder.normalizer.save(folder / files.NORMALIZER_FILE)
-        files.write_json(folder / files.TEXT_ENCODER_FILE, self.text_encoder.config())
-        files.write_json(folder / files.PIPELINE_FILE, {"kind": self.kind, "format": files.FORMAT})
-        return folder
