@@ -20,8 +20,8 @@ from controlmm.motion.layout import feature_layout
 from controlmm.motion.skeleton import Skeleton
 from controlmm.ops import recover_joints
 
-# On 256 validation clips 3 steps bring skating from 0.178 to 0.123 (recorded 0.103) and FID from 4.4 to 4.6; 4
-# would bring 0.115 and 4.8.
+# On 256 validation clips 3 steps bring skating from 0.178 to 0.123 (recorded 0.103) and FID from 4.4 to 4.6;
+# 4 would bring 0.115 and 4.8.
 _ITERATIONS = 3
 _WEIGHT = 15.0  # for each m^2 of squared steps; L-BFGS stops by absolute changes
 _IS_CONTACT = 0.5  # of a contact channel, which is 1 at rest and 0 in motion
