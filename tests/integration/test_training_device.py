@@ -18,7 +18,7 @@ from controlmm.training.stages import train_stage
 def root(tiny_data_folder, tmp_path_factory):
     """The stages that others stand on, after one step."""
     root = tmp_path_factory.mktemp("root")
-    for stage in ("rvq", "masked", "tl-vq"):
+    for stage in ("rvq", "masked", "residual", "tl-vq"):
         train_stage(
             stage,
             data=tiny_data_folder,
