@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from controlmm.generation.controlled_layers import ControlledLayers
+from controlmm.generation.controlled_layers import ControlledLayers, without_base
 from controlmm.generation.decoding_rules import DecodingRules, likeliest_share
 from controlmm.generation.editing import EditingBudget, edit_logits
 from controlmm.generation.kept_tokens import KeptTokens
@@ -216,10 +216,8 @@ def final_latents(
     """
     if request.rules.final_tokens == "sampled":
         return tokenizer.quantizer.lookup(ids)
-    residuals = ids.clone()
-    residuals[..., 0] = -1
     soft = token_mixture(logits) @ tokenizer.base_codes * request.valid[..., None]
-    return soft + tokenizer.quantizer.lookup(residuals)
+    return soft + tokenizer.quantizer.lookup(without_base(ids))
 
 
 def guided(

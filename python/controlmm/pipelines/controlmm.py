@@ -242,7 +242,7 @@ class ControlMM(MotionPipeline[Preset]):
         """Latents of a batch of clips of different texts, lengths and targets (canonical frame).
 
         Clips without any target are decoded with the control branch off: from text alone, and then edited if
-        there are ``terms``.
+        there are ``terms``, else with their feet planted as strongly as ``preset`` is natural.
 
         Raises:
             ValueError: If a target lies after the end of its clip.
