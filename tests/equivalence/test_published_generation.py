@@ -8,6 +8,7 @@ decoder and the stream of noise are the pipeline's own; all between them is writ
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -16,6 +17,7 @@ from controlmm.controls import JointControl, densify
 from controlmm.generation.decoding_rules import DecodingRules
 from controlmm.generation.editing import EditingBudget
 from controlmm.generation.noise import ClipNoise
+from controlmm.models.control_branch import ControlBranch
 from controlmm.motion.skeleton import HUMANML3D
 from controlmm.pipelines import Preset
 
@@ -127,6 +129,10 @@ class Published:
 def scene(tiny_pipeline):
     dense = densify(CONTROLS, 4 * TOKENS, HUMANML3D)
     text = tiny_pipeline.text_encoder.encode(["a person walks and waves"]).pooled
+    config = replace(tiny_pipeline.control.config, sees_missing_speed=False)
+    tiny_pipeline.control = ControlBranch.beside(tiny_pipeline.transformer, config).eval()
+    for zero in (tiny_pipeline.control.first_zero, *tiny_pipeline.control.mid_zeros):
+        torch.nn.init.normal_(zero.weight, std=0.1, generator=torch.Generator().manual_seed(6))
     return tiny_pipeline, text, dense.targets[None], dense.mask[None]
 
 

@@ -43,8 +43,10 @@ def make_recipe(masks: str, joints: tuple[int, ...]) -> ControlRecipe:
     samplers = [TokenSampler(clips, decoder.normalizer, tokenizer, text, progress=False) for _ in range(2)]
     base = MaskedTransformer(MaskedTransformerConfig.tiny())
     base.head[-1].weight.data.mul_(30)
-    config = dataclasses.replace(ControlBranchConfig.tiny(), joints=joints, has_observation_mask=False)
-    options = ControlOptions(masks=masks, drops_text=False, finer_layers="none")
+    config = dataclasses.replace(
+        ControlBranchConfig.tiny(), joints=joints, has_observation_mask=False, sees_missing_speed=False
+    )
+    options = ControlOptions(masks=masks, drops_text=False, finer_layers="none", drawn_share=0)
     recipe = ControlRecipe(config, base, decoder, *samplers, options=options)
     for zero in (recipe.model.first_zero, *recipe.model.mid_zeros):
         torch.nn.init.normal_(zero.weight, std=0.1)

@@ -9,6 +9,7 @@ import torch
 
 from controlmm.data import Caption, FeatureClip
 from controlmm.motion.features import bone_lengths, joints_to_features
+from controlmm.motion.heading import heading
 from controlmm.motion.skeleton import HUMANML3D, KIT
 from controlmm.ops import recover_joints
 from controlmm.training.augmentation import Augmentation, augmented
@@ -17,7 +18,6 @@ from controlmm.training.motion_changes import (
     BLEND_FRAMES,
     along_bent_way,
     at_speed,
-    facing,
     joined,
     pose_distance,
 )
@@ -66,7 +66,7 @@ def test_a_bent_straight_way_is_an_arc_of_the_same_length(straight, degrees):
     assert chord.item() == pytest.approx(abs(2 * way / angle * math.sin(angle / 2)), rel=ARC)
     steps = bent[:, 0].diff(dim=0)[:, [0, 2]].norm(dim=1)
     torch.testing.assert_close(steps, torch.full_like(steps, 0.05), rtol=0, atol=ROUNDING)
-    turned = facing(bent[-1], HUMANML3D) - facing(straight[-1], HUMANML3D)
+    turned = heading(bent[-1], HUMANML3D) - heading(straight[-1], HUMANML3D)
     assert turned.item() == pytest.approx(angle, abs=1e-6)
     torch.testing.assert_close(bent[..., 1], straight[..., 1], rtol=0, atol=ROUNDING)
 
@@ -178,7 +178,7 @@ def test_features_of_new_clips_are_those_of_their_joints(clips, kind):
         joints = recover_joints(clip.features[None].double(), joints=22)[0]
         again = recover_joints(joints_to_features(joints, public_quirks=False)[None], joints=22)[0]
         # a shorter clip smooths its first heading a little otherwise: compare up to a turn about the start
-        turn = facing(joints[0], HUMANML3D) - facing(again[0].double(), HUMANML3D)
+        turn = heading(joints[0], HUMANML3D) - heading(again[0].double(), HUMANML3D)
         x, y, z = again.double().unbind(-1)
         again = torch.stack([x * turn.cos() + z * turn.sin(), y, z * turn.cos() - x * turn.sin()], -1)
         torch.testing.assert_close(again, joints[: len(again)], rtol=0, atol=1e-4)

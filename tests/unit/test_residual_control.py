@@ -17,7 +17,7 @@ from controlmm.generation.controlled_layers import ControlledLayers, without_bas
 from controlmm.generation.editing import EditingBudget
 from controlmm.generation.kept_tokens import KeptTokens
 from controlmm.models.masked_transformer import MaskedTransformer, MaskedTransformerConfig
-from controlmm.models.residual_control import ResidualControl, ResidualControlConfig, slopes
+from controlmm.models.residual_control import ResidualControl, ResidualControlConfig
 from controlmm.models.residual_transformer import ResidualTransformer, ResidualTransformerConfig
 from controlmm.motion.skeleton import HUMANML3D, KIT
 from controlmm.pipelines import PRESETS
@@ -54,59 +54,6 @@ def goals(frames: int, clips: int = 1) -> tuple[torch.Tensor, torch.Tensor]:
     mask = torch.zeros(clips, frames, 22, 3, dtype=torch.bool)
     mask[:, [3, 9, 14], 0] = True
     return targets, mask
-
-
-# --- the signal ---
-
-
-def test_slopes_are_those_of_the_line_through_what_is_known():
-    """From 0 at frame 0 to 4 at frame 2 (2 a frame), to 1 at frame 5 (-1 a frame), flat from there."""
-    values, mask = torch.zeros(1, 7, 1, 3), torch.zeros(1, 7, 1, 3, dtype=torch.bool)
-    values[0, 2], values[0, 5] = 4.0, 1.0
-    mask[0, [2, 5], 0, 0] = True
-    found = slopes(values, mask)
-    assert found[0, :, 0, 0].tolist() == [2, 2, -1, -1, -1, 0, 0]
-    assert not found[..., 1:].any()  # without a target there is nothing to go to
-    mask[0, 0, 0, 0] = True
-    values[0, 0] = 2.0  # a target in frame 0 takes the place of the origin
-    assert slopes(values, mask)[0, :2, 0, 0].tolist() == [1, 1]
-
-
-def test_dense_slopes_are_the_steps():
-    values = torch.randn(2, 9, 3, 3, generator=torch.Generator().manual_seed(2))
-    found = slopes(values, torch.ones_like(values, dtype=torch.bool))
-    torch.testing.assert_close(found[:, :-1], values.diff(dim=1))
-    assert not found[:, -1].any()
-
-
-def test_what_is_missing_is_seen_from_the_body(control, walking_joints, yawed):
-    """Somebody should be a metre further on the way that the body faces: forward is +Z, wherever that is."""
-    current = yawed(walking_joints[:8], math.pi / 2).float()[None]
-    mask = torch.zeros_like(current, dtype=torch.bool)
-    mask[0, 5, 0] = True
-    ahead = math.atan2(*[float(x) for x in _forward(current[0, 5])])
-    step = torch.tensor([math.sin(ahead), 0.0, math.cos(ahead)])
-    signal = control.signal(current + step, mask, current)[0]
-    missing, speed, known = signal[:, :66], signal[:, 66:132], signal[:, 132:]
-    torch.testing.assert_close(missing[5, :3], torch.tensor([0.0, 0.0, 1.0]), rtol=0, atol=TURNED)
-    assert speed[:5, :3].norm(dim=1).tolist() == pytest.approx([20 / 5] * 5, abs=TURNED)
-    assert known[5, :3].tolist() == [1, 1, 1]
-    assert not signal[6:].any()
-
-
-def test_turning_the_scene_changes_nothing(control, walking_joints, yawed):
-    current = walking_joints[:16].float()[None]
-    targets, mask = goals(16)
-    turned = [yawed(points[0].double(), 1.1).float()[None] for points in (targets, current)]
-    torch.testing.assert_close(
-        control.signal(targets, mask, current), control.signal(turned[0], mask, turned[1]), rtol=0, atol=1e-4
-    )
-
-
-def _forward(pose: torch.Tensor) -> torch.Tensor:
-    """(x, z) at a right angle to hips and shoulders, which point to the left."""
-    across = pose[1] - pose[2] + pose[16] - pose[17]
-    return torch.stack([-across[2], across[0]])
 
 
 # --- the network ---

@@ -140,7 +140,7 @@ def test_the_consistency_loss_sees_the_recorded_finer_layers_unless_switched_off
     certain = 1e4 * torch.nn.functional.one_hot(batch.ids[..., 0].clamp(min=0), 32).float()
     for layers in ("recorded", "none"):
         torch.manual_seed(4)
-        options = ControlOptions(finer_layers=layers, masks="trajectory")
+        options = ControlOptions(finer_layers=layers, masks="trajectory", drawn_share=0)
         recipe = ControlRecipe(ControlBranchConfig.tiny(), base, decoder, *samplers, options=options)
         recipe.model.forward = lambda *_: certain
         torch.manual_seed(5)
@@ -155,6 +155,36 @@ def test_the_consistency_loss_sees_the_recorded_finer_layers_unless_switched_off
         expected = masked_consistency_loss(made, targets, mask, norm="l1").item()
         assert losses[layers] == pytest.approx(expected, rel=1e-5)
     assert losses["recorded"] != pytest.approx(losses["none"], rel=1e-3)
+
+
+def test_among_drawn_tokens_a_fresh_branch_is_natural_already(decoder, samplers, base):
+    """It changes nothing of what the frozen model would choose, which is all that is asked for there."""
+    steepest = {}
+    for share in (0.0, 1.0):
+        torch.manual_seed(4)
+        options = ControlOptions(alpha=1.0, drawn_share=share, drops_text=False)
+        recipe = ControlRecipe(ControlBranchConfig.tiny(), base, decoder, *samplers, options=options)
+        recipe.loss(4)["loss"].backward()
+        steepest[share] = recipe.model.mid_zeros[-1].weight.grad.abs().max().item()
+    assert steepest[1.0] < 1e-6 < 1e-3 < steepest[0.0]
+
+
+def test_drawn_tokens_come_from_one_step_of_the_controlled_model(decoder, samplers, base):
+    """With logits that leave no doubt the visible tokens are those, whatever was recorded."""
+    batch = samplers[0].whole([0, 1, 2])
+    certain = torch.full((*batch.ids.shape[:2], 32), -1e4)
+    certain[..., 7] = 0
+    seen = []
+    recipe = ControlRecipe(
+        ControlBranchConfig.tiny(), base, decoder, *samplers, options=ControlOptions(drawn_share=1.0)
+    )
+    recipe.model.forward = lambda *_: certain
+    embed = base.embed
+    base.embed = lambda ids: seen.append(ids) or embed(ids)
+    recipe._losses(batch)
+    visible = seen[1][batch.valid & (seen[1] < 32)]  # in the second look; the first is of recorded ones
+    assert (visible == 7).float().mean() > 0.8  # the others were made random, as in all training
+    assert (seen[1][~batch.valid] == base.pad_id).all()
 
 
 def test_the_norm_of_the_consistency_loss_can_be_chosen(decoder, samplers, base):
@@ -363,6 +393,7 @@ def test_fresh_codes_are_random_rows_or_the_first_ones():
         (ControlOptions, {"finer_layers": "some"}, r"`finer_layers` must be one of .*, got 'some'"),
         (MaskedOptions, {"loss_on": "some"}, r"`loss_on` must be 'all' or 'chosen', got 'some'"),
         (ControlOptions, {"alpha": 1.5}, r"`alpha` must be in \[0, 1\], got 1\.5"),
+        (ControlOptions, {"drawn_share": -0.1}, r"`drawn_share` must be in \[0, 1\], got -0\.1"),
         (ControlOptions, {"share_of": 0}, r"`share_of` must be at least 1"),
         (MaskedOptions, {"embed_loss_weight": 2.0}, r"`embed_loss_weight` must be in \[0, 1\]"),
         (MaskedOptions, {"logit_noise_std": -1.0}, r"`logit_noise_std` not negative"),

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from controlmm.models.masked_transformer import MaskedTransformer, MaskedTransformerConfig, with_text_token
+from controlmm.models.missing_path import missing_in_heading
 from controlmm.motion.skeleton import Skeleton
 from controlmm.nn.checkpoint import PretrainedModel
 from controlmm.nn.conv import ConvEncoder
@@ -30,12 +31,15 @@ class ControlBranchConfig:
     dropout: float = 0.2
     joints: tuple[int, ...] = (0, 10, 11, 15, 20, 21)  # that the control signal can name
     has_observation_mask: bool = True  # say which targets exist; published: no, a zero target reads as none
+    # Say in the body's heading what is missing, and which speed would bring it: ours, not published.
+    sees_missing_speed: bool = False
     encoder_width: int = 512  # of the convolutional control encoder
     encoder_depth: int = 3
     downsample: int = 4
     into_frozen_trunk: bool = True  # published code; the paper's figure feeds only the copy
     encoder: _EncoderKind = "convolution"  # published code; the paper's words
     signal_scale: float = 1.0  # metres for each unit of the skeleton: 0.001 for KIT-ML
+    fps: float = 20.0
 
     def __post_init__(self) -> None:
         if self.width % self.heads:
@@ -48,16 +52,16 @@ class ControlBranchConfig:
     @property
     def signal_dim(self) -> int:
         """Channels of the control signal."""
-        return len(self.joints) * (9 if self.has_observation_mask else 6)
+        return len(self.joints) * (6 + 3 * self.has_observation_mask + 6 * self.sees_missing_speed)
 
     @classmethod
     def paper(cls) -> ControlBranchConfig:
-        """The published size, 21.4 M parameters, for six joints, with the mask in the signal."""
-        return cls()
+        """The published size, 21.4 M parameters, for six joints, with the whole signal."""
+        return cls(sees_missing_speed=True)
 
     @classmethod
     def published(cls) -> ControlBranchConfig:
-        """The layout of the published weights: their signal does not say which targets exist."""
+        """The layout of the published weights: their signal is differences and targets only."""
         return cls(has_observation_mask=False)
 
     @classmethod
@@ -70,6 +74,7 @@ class ControlBranchConfig:
             feedforward=512,
             dropout=0.1,
             joints=tuple(range(22)),
+            sees_missing_speed=True,
             encoder_width=128,
         )
 
@@ -78,14 +83,14 @@ class ControlBranchConfig:
         """For tests."""
         return cls(
             width=16, heads=2, layers=2, feedforward=32, dropout=0.0, joints=tuple(range(22)),
-            encoder_width=8, encoder_depth=1,
+            sees_missing_speed=True, encoder_width=8, encoder_depth=1,
         )  # fmt: skip
 
     def for_skeleton(self, skeleton: Skeleton) -> ControlBranchConfig:
         """The same sizes for another skeleton: all of its joints, or its six control joints."""
         names_all = len(self.joints) > len(skeleton.control_joints)
         joints = tuple(range(skeleton.num_joints)) if names_all else skeleton.control_joints
-        return replace(self, joints=joints, signal_scale=skeleton.metres)
+        return replace(self, joints=joints, signal_scale=skeleton.metres, fps=skeleton.fps)
 
     def check_base(self, base: MaskedTransformerConfig) -> None:
         """Raise ``ValueError`` unless the branch fits the masked transformer."""
@@ -135,7 +140,10 @@ class ControlBranch(PretrainedModel):
         mask: Bool[Tensor, "B T J 3"],
         current: Float[Tensor, "B T J 3"],
     ) -> Float[Tensor, "B T S"]:
-        """The control signal: masked (target - current), masked target, and the mask; joint-major, metres.
+        """The control signal: masked (target - current), masked target, the mask, and what is missing.
+
+        Joint-major, in metres and m/s; the last part is :func:`missing_in_heading`'s. How many of the parts
+        there are is a matter of the configuration.
 
         Args:
             targets: Global positions to reach, in the skeleton's unit.
@@ -148,6 +156,9 @@ class ControlBranch(PretrainedModel):
         difference = torch.where(mask, targets - current, 0.0)[:, :, joints] * scale
         target = torch.where(mask, targets, 0.0)[:, :, joints] * scale
         parts = [difference, target, observed] if self.config.has_observation_mask else [difference, target]
+        if self.config.sees_missing_speed:
+            ways = missing_in_heading(targets, mask, current, metres=scale, fps=self.config.fps)
+            parts += [way[:, :, joints] for way in ways]
         return torch.cat([part.flatten(2) for part in parts], dim=-1)
 
     def forward(

@@ -9,8 +9,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from controlmm.models.missing_path import missing_in_heading
 from controlmm.models.residual_transformer import ResidualTransformerConfig
-from controlmm.motion.skeleton import Skeleton, skeleton_of_joints
+from controlmm.motion.skeleton import Skeleton
 from controlmm.nn.checkpoint import PretrainedModel
 from controlmm.nn.conv import ConvEncoder
 from controlmm.nn.trunk import zero_linear
@@ -112,10 +113,10 @@ class ResidualControl(PretrainedModel):
             current: Positions of the motion decoded from the layers so far.
         """
         joints = list(self.config.joints)
-        missing = torch.where(mask, targets - current, 0.0) * self.config.signal_scale
-        speed = slopes(missing, mask) * self.config.fps
-        heading = _facing(current)[:, :, None]
-        parts = [_turned(missing, heading), _turned(speed, heading), mask.to(current.dtype)]
+        missing, speed = missing_in_heading(
+            targets, mask, current, metres=self.config.signal_scale, fps=self.config.fps
+        )
+        parts = [missing, speed, mask.to(current.dtype)]
         return torch.cat([part[:, :, joints].flatten(2) for part in parts], dim=-1)
 
     def forward(
@@ -129,33 +130,3 @@ class ResidualControl(PretrainedModel):
         encoded = torch.relu(self.encoder(signal.transpose(1, 2), frames).transpose(1, 2))
         encoded = encoded * self.factors[layer - 1][:, None]
         return [linear(encoded) for linear in self.zeros]
-
-
-def slopes(values: Float[Tensor, "B T J 3"], mask: Bool[Tensor, "B T J 3"]) -> Float[Tensor, "B T J 3"]:
-    """Slope per frame of the polyline through the values that ``mask`` marks, in the piece after each frame.
-
-    The line starts from 0 at frame 0, where every motion stands at the origin; it is flat after the last
-    marked frame.
-    """
-    frames = values.shape[1]
-    time = torch.arange(frames, device=values.device)[None, :, None, None].expand(mask.shape)
-    before = torch.where(mask, time, 0).cummax(dim=1).values
-    marked_from = torch.where(mask, time, frames).flip(1).cummin(dim=1).values.flip(1)
-    after = torch.cat([marked_from[:, 1:], torch.full_like(marked_from[:, :1], frames)], dim=1)
-    rise = values.gather(1, after.clamp(max=frames - 1)) - values.gather(1, before)
-    return torch.where(after < frames, rise / (after - before).clamp(min=1), 0.0)
-
-
-def _facing(joints: Float[Tensor, "B T J 3"]) -> Float[Tensor, "B T"]:
-    """Angle about Y, in radians, that turns +Z to where hips and shoulders face."""
-    right_hip, left_hip, right_shoulder, left_shoulder = skeleton_of_joints(joints.shape[2]).facing
-    across = joints[:, :, left_hip] - joints[:, :, right_hip]
-    across = across + joints[:, :, left_shoulder] - joints[:, :, right_shoulder]
-    return torch.atan2(-across[..., 2], across[..., 0])
-
-
-def _turned(vectors: Float[Tensor, "B T J 3"], heading: Float[Tensor, "B T 1"]) -> Float[Tensor, "B T J 3"]:
-    """World vectors as somebody sees them who faces ``heading``."""
-    x, y, z = vectors.unbind(-1)
-    cos, sin = heading.cos(), heading.sin()
-    return torch.stack([cos * x - sin * z, y, sin * x + cos * z], dim=-1)

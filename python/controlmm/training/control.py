@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import cross_entropy, one_hot
 
 from controlmm.generation.controlled_layers import without_base
 from controlmm.generation.motion_decoder import MotionDecoder
@@ -22,7 +24,7 @@ from controlmm.training.corruption import corrupt_tokens
 from controlmm.training.masked import token_cross_entropy
 from controlmm.training.recipe import Recipe
 from controlmm.training.samples import clips_with_control
-from controlmm.training.soft_tokens import Sampling, mixed_codes
+from controlmm.training.soft_tokens import Sampling, drawn_ids, mixed_codes
 from controlmm.training.stage import Stage, StageInputs, best_weights, by_size, load_tokenizer
 from controlmm.training.tokens import TokenBatch, TokenSampler
 
@@ -51,6 +53,9 @@ class ControlOptions:
     # Residual codes in the motion that the consistency loss sees; published: none. Base codes alone miss even
     # their own recording's path by far, so without finer layers this loss pulls against the cross-entropy.
     finer_layers: FinerLayers = "recorded"
+    # Of the clips whose visible tokens the model has drawn itself, as in decoding, where it has to make up
+    # for their drift; published: none. They are compared with what the frozen model would choose there.
+    drawn_share: float = 0.5
 
     def __post_init__(self) -> None:
         for name, kind in (
@@ -61,6 +66,8 @@ class ControlOptions:
         ):
             if getattr(self, name) not in get_args(kind):
                 raise ValueError(f"`{name}` must be one of {get_args(kind)}, got {getattr(self, name)!r}.")
+        if not 0 <= self.drawn_share <= 1:
+            raise ValueError(f"`drawn_share` must be in [0, 1], got {self.drawn_share}.")
         if self.alpha is not None and not 0 <= self.alpha <= 1:
             raise ValueError(f"`alpha` must be in [0, 1], got {self.alpha}.")
         if self.share_of is not None and self.share_of < 1:
@@ -109,41 +116,108 @@ class ControlRecipe:
         return {"stage": "control", "alpha": self.options.cross_entropy_share}
 
     def _losses(self, batch: TokenBatch) -> dict[str, Tensor]:
-        device = self.model.device
-        base, decoder = self.base.to(device), self.decoder.to(device)
-        skeleton = decoder.normalizer.skeleton
+        device, skeleton = self.model.device, self.decoder.normalizer.skeleton
+        self.base, self.decoder = self.base.to(device), self.decoder.to(device)
+        is_drawn = torch.zeros(len(batch.ids), dtype=torch.bool, device=device)
+        if self.options.drawn_share:  # else no random number is taken, as in the published training
+            is_drawn = (torch.rand(len(is_drawn)) < self.options.drawn_share).to(device)
+        corrupted = self._corrupted(batch.ids[..., 0], batch.valid).to(device)
+        mask = sample_masks(
+            self.options.masks, batch.frames, joints=skeleton.num_joints, among=skeleton.control_joints
+        ).to(device)
+        batch = batch.to(device)
+        targets = self._joints(batch.features)
+        if is_drawn.any():
+            drawn = self._drawn(corrupted, batch, targets, mask)
+            again = self._corrupted(drawn.cpu(), batch.valid.cpu()).to(device)
+            corrupted = torch.where(is_drawn[:, None], again, corrupted)
+
+        drops_text = self.model.training and self.options.drops_text
+        text = drop_text(batch.text, self.base.config.text_dropout) if drops_text else batch.text
+        logits = self._logits(corrupted, text, batch, targets, mask)
+        tokens = self._cross_entropy(logits, corrupted, text, batch, is_drawn)
+        consistency = self._consistency(logits, batch, targets, mask, is_drawn)
+        alpha = self.options.cross_entropy_share
+        loss = alpha * tokens + (1 - alpha) * consistency
+        return {"loss": loss, "cross_entropy": tokens, "consistency": consistency}
+
+    def _corrupted(self, ids: Int[Tensor, "B L"], valid: Bool[Tensor, "B L"]) -> Int[Tensor, "B L"]:
+        base = self.base
         corrupted, _ = corrupt_tokens(
-            batch.ids[..., 0],
-            batch.valid,
+            ids,
+            valid,
             codebook_size=base.config.codebook_size,
             mask_id=base.mask_id,
             pad_id=base.pad_id,
             share_of=self.options.share_of,
         )
-        mask = sample_masks(
-            self.options.masks, batch.frames, joints=skeleton.num_joints, among=skeleton.control_joints
-        )
-        batch, corrupted, mask = batch.to(device), corrupted.to(device), mask.to(device)
-        ids, frames = batch.ids[..., 0], batch.frames
+        return corrupted
+
+    @torch.no_grad()
+    def _drawn(
+        self,
+        corrupted: Int[Tensor, "B L"],
+        batch: TokenBatch,
+        targets: Float[Tensor, "B T J 3"],
+        mask: Bool[Tensor, "B T J 3"],
+    ) -> Int[Tensor, "B L"]:
+        """Tokens as one step of decoding under control draws them."""
+        training = self.model.training
+        self.model.eval()
+        drawn = drawn_ids(self._logits(corrupted, batch.text, batch, targets, mask))
+        self.model.train(training)
+        return drawn
+
+    def _logits(
+        self,
+        corrupted: Int[Tensor, "B L"],
+        text: Float[Tensor, "B E"],
+        batch: TokenBatch,
+        targets: Float[Tensor, "B T J 3"],
+        mask: Bool[Tensor, "B T J 3"],
+    ) -> Float[Tensor, "B L K"]:
+        base, decoder = self.base, self.decoder
         with torch.no_grad():
-            targets = self._joints(batch.features)
-            current = decoder(decoder.base_latents(corrupted, batch.valid), frames)
-
-        drops_text = self.model.training and self.options.drops_text
-        text = drop_text(batch.text, base.config.text_dropout) if drops_text else batch.text
+            current = decoder(decoder.base_latents(corrupted, batch.valid), batch.frames)
         sequence = base.sequence(base.embed(corrupted), text)
-        logits = self.model(base, sequence, self.model.signal(targets, mask, current), batch.valid).float()
-        latents = mixed_codes(logits, decoder.tokenizer.base_codes, self.options.sampling)
-        if self.options.finer_layers == "recorded":
-            latents = latents + decoder.tokenizer.quantizer.lookup(without_base(batch.ids))
-        joints = decoder(latents * batch.valid[..., None], frames)
-        metres = skeleton.metres
-        consistency = masked_consistency_loss(joints * metres, targets * metres, mask, norm=self.options.norm)
-        tokens = token_cross_entropy(logits, ids)
-        alpha = self.options.cross_entropy_share
-        loss = alpha * tokens + (1 - alpha) * consistency
-        return {"loss": loss, "cross_entropy": tokens, "consistency": consistency}
+        signal = self.model.signal(targets, mask, current)
+        logits: Tensor = self.model(base, sequence, signal, batch.valid)
+        return logits.float()
 
+    def _cross_entropy(
+        self,
+        logits: Float[Tensor, "B L K"],
+        corrupted: Int[Tensor, "B L"],
+        text: Float[Tensor, "B E"],
+        batch: TokenBatch,
+        is_drawn: Bool[Tensor, "B"],
+    ) -> Float[Tensor, ""]:
+        """With the recorded tokens; among drawn ones, with what the frozen model would choose."""
+        if not is_drawn.any():
+            return token_cross_entropy(logits, batch.ids[..., 0])
+        with torch.no_grad():
+            free = self.base(self.base.embed(corrupted), text, batch.valid).float().softmax(-1)
+            recorded = one_hot(batch.ids[..., 0].clamp(min=0), free.shape[-1]).to(free.dtype)
+        natural = torch.where(is_drawn[:, None, None], free, recorded)
+        return cross_entropy(logits[batch.valid], natural[batch.valid])
+
+    def _consistency(
+        self,
+        logits: Float[Tensor, "B L K"],
+        batch: TokenBatch,
+        targets: Float[Tensor, "B T J 3"],
+        mask: Bool[Tensor, "B T J 3"],
+        is_drawn: Bool[Tensor, "B"],
+    ) -> Float[Tensor, ""]:
+        tokenizer, metres = self.decoder.tokenizer, self.decoder.normalizer.skeleton.metres
+        latents = mixed_codes(logits, self.decoder.tokenizer.base_codes, self.options.sampling)
+        if self.options.finer_layers == "recorded":
+            finer = tokenizer.quantizer.lookup(without_base(batch.ids))
+            latents = latents + torch.where(is_drawn[:, None, None], 0.0, finer)
+        joints = self.decoder(latents * batch.valid[..., None], batch.frames)
+        return masked_consistency_loss(joints * metres, targets * metres, mask, norm=self.options.norm)
+
+    @torch.no_grad()
     def _joints(self, features: Tensor) -> Tensor:
         return recover_joints(
             self.decoder.normalizer.denormalize(features), joints=self.decoder.normalizer.skeleton.num_joints

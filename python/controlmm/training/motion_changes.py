@@ -12,7 +12,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from controlmm.motion.features import bone_lengths
-from controlmm.motion.skeleton import Skeleton, skeleton_of_joints
+from controlmm.motion.heading import heading, turned
+from controlmm.motion.skeleton import skeleton_of_joints
 
 BLEND_FRAMES = 8  # over which the first clip fades into the second
 _WAY_SMOOTHING = 11  # frames; the heading of a bent way must not follow the sway of the steps
@@ -36,9 +37,9 @@ def along_bent_way(joints: Float[Tensor, "F J 3"], degrees: float) -> Float[Tens
     ground = joints[:, :1] * joints.new_tensor([1, 0, 1])
     covered = torch.cat([ground.new_zeros(1), _smooth(ground[:, 0]).diff(dim=0).norm(dim=1).cumsum(0)])
     yaw = math.radians(degrees) * covered / covered[-1].clamp(min=1e-9)
-    steps = _turned(ground.diff(dim=0), (yaw[1:] + yaw[:-1])[:, None] / 2)
+    steps = turned(ground.diff(dim=0), (yaw[1:] + yaw[:-1])[:, None] / 2)
     bent = torch.cat([ground[:1], ground[:1] + steps.cumsum(0)])
-    return _turned(joints - ground, yaw[:, None]) + bent
+    return turned(joints - ground, yaw[:, None]) + bent
 
 
 def joined(first: Float[Tensor, "F J 3"], second: Float[Tensor, "G J 3"]) -> Float[Tensor, "H J 3"]:
@@ -54,9 +55,9 @@ def joined(first: Float[Tensor, "F J 3"], second: Float[Tensor, "G J 3"]) -> Flo
         )
     skeleton = skeleton_of_joints(first.shape[1])
     end, middle = first[-blend:], blend // 2
-    yaw = facing(end[middle], skeleton) - facing(second[middle], skeleton)
+    yaw = heading(end[middle], skeleton) - heading(second[middle], skeleton)
     flat = first.new_tensor([1, 0, 1])
-    second = _turned(second - second[middle, 0] * flat, yaw) + end[middle, 0] * flat
+    second = turned(second - second[middle, 0] * flat, yaw) + end[middle, 0] * flat
     share = torch.linspace(0, 1, blend + 2, dtype=first.dtype)[1:-1, None, None]
     share = share.square() * (3 - 2 * share)  # smooth at both ends
     blended = _with_bone_lengths(end.lerp(second[:blend], share), first)
@@ -69,15 +70,8 @@ def pose_distance(first: Float[Tensor, "F J 3"], second: Float[Tensor, "G J 3"])
     poses = []
     for pose in (first[-BLEND_FRAMES // 2], second[BLEND_FRAMES // 2]):
         on_spot = pose - pose[0] * pose.new_tensor([1, 0, 1])
-        poses.append(_turned(on_spot, -facing(pose, skeleton)))
+        poses.append(turned(on_spot, -heading(pose, skeleton)))
     return float((poses[0] - poses[1]).norm(dim=-1).mean())
-
-
-def facing(pose: Float[Tensor, "J 3"], skeleton: Skeleton) -> Tensor:
-    """Angle about Y, in radians, that turns +Z to where the hips and shoulders face."""
-    right_hip, left_hip, right_shoulder, left_shoulder = skeleton.facing
-    across = pose[left_hip] - pose[right_hip] + pose[left_shoulder] - pose[right_shoulder]
-    return torch.atan2(-across[2], across[0])
 
 
 def _with_bone_lengths(
@@ -91,12 +85,6 @@ def _with_bone_lengths(
         bone = torch.nn.functional.normalize(joints[:, joint] - joints[:, parent], dim=-1)
         placed.append(placed[parent] + bone * wanted[joint])
     return torch.stack(placed, dim=1)
-
-
-def _turned(points: Float[Tensor, "*F J 3"], yaw: Tensor) -> Float[Tensor, "*F J 3"]:
-    """Points turned left about Y by ``yaw`` radians, which broadcasts with the leading axes."""
-    x, y, z = points.unbind(-1)
-    return torch.stack([x * yaw.cos() + z * yaw.sin(), y, z * yaw.cos() - x * yaw.sin()], dim=-1)
 
 
 def _smooth(places: Float[Tensor, "F 3"]) -> Float[Tensor, "F 3"]:

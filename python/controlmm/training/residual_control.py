@@ -25,6 +25,7 @@ from controlmm.training.corruption import corrupt_tokens
 from controlmm.training.recipe import Recipe
 from controlmm.training.residual import random_layers
 from controlmm.training.samples import clips_with_controlled_layers
+from controlmm.training.soft_tokens import drawn_ids
 from controlmm.training.stage import Stage, StageInputs, best_weights, by_size, load_tokenizer
 from controlmm.training.tokens import TokenBatch, TokenSampler
 
@@ -115,7 +116,7 @@ class ResidualControlRecipe:
         with torch.no_grad():
             features = decoder.normalizer.denormalize(batch.features)
             targets = recover_joints(features, joints=skeleton.num_joints)
-            drawn = _drawn(base(base.embed(corrupted), batch.text, batch.valid))
+            drawn = drawn_ids(base(base.embed(corrupted), batch.text, batch.valid))
             first = torch.where(is_drawn[:, None] & batch.valid, drawn, batch.ids[..., 0])
             control = ControlledLayers(
                 self.model, decoder, targets, mask, decoder.tokenizer.quantizer.lookup(first[..., None])
@@ -211,12 +212,6 @@ class ResidualControlRecipe:
         ids[~is_recorded] = -1
         latents: Tensor = self.decoder.tokenizer.quantizer.lookup(ids)
         return latents
-
-
-def _drawn(logits: Float[Tensor, "B L K"]) -> Int[Tensor, "B L"]:
-    """A code for every token, from the distribution that the logits stand for."""
-    noise = torch.empty_like(logits, dtype=torch.float32).exponential_().clamp_(min=1e-30).log_().neg_()
-    return (logits.float() + noise).argmax(-1)
 
 
 def _build(config: ResidualControlConfig, inputs: StageInputs) -> Recipe:

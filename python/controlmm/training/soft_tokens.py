@@ -1,11 +1,11 @@
-"""Differentiable tokens for training: what takes the place of a drawn code (ControlMM, equation 3)."""
+"""Tokens drawn in training, and what takes their place to be differentiable (ControlMM, equation 3)."""
 
 from __future__ import annotations
 
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from controlmm.generation.token_mixture import token_mixture
@@ -34,3 +34,9 @@ def mixed_codes(
         noise = gumbel_noise((batch, tokens, count), seed=seed, dtype=logits.dtype)
         return token_mixture(logits, noise, as_printed=True) @ codes
     return gumbel_straight_through(logits, codes, seed=seed, hard=sampling == "gumbel_st")[0]
+
+
+def drawn_ids(logits: Float[Tensor, "B L K"]) -> Int[Tensor, "B L"]:
+    """A code for every token, from the distribution that the logits stand for."""
+    noise = torch.empty_like(logits, dtype=torch.float32).exponential_().clamp_(min=1e-30).log_().neg_()
+    return (logits.float() + noise).argmax(-1)
