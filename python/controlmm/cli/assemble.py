@@ -52,6 +52,7 @@ def _controlmm(root: Path, encoder: TextEncoder) -> tuple[MotionPipeline[Any], d
     from controlmm.models.residual_control import ResidualControl
     from controlmm.models.residual_transformer import ResidualTransformer
     from controlmm.pipelines import ControlMM
+    from controlmm.pipelines.guidance import TRAINED_HERE
     from controlmm.training.stage import load_tokenizer, tokenizer_stage
 
     tokenizer, normalizer = load_tokenizer(root)
@@ -64,6 +65,7 @@ def _controlmm(root: Path, encoder: TextEncoder) -> tuple[MotionPipeline[Any], d
         normalizer=normalizer,
         text_encoder=encoder,
         length=_optional(LengthEstimator, root, "length"),
+        guidance=TRAINED_HERE,
     )
     stages = {
         "tokenizer": tokenizer_stage(root),

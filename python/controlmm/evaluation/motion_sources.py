@@ -122,7 +122,7 @@ class Generated:
     """A pipeline's motions under one of its presets."""
 
     def __init__(self, pipeline: MotionPipeline[Any], preset: Any) -> None:
-        self.pipeline, self.preset = pipeline, preset
+        self.pipeline, self.preset = pipeline, pipeline.resolve_preset(preset, None)
 
     def describe(self) -> dict[str, Any]:
         """See :class:`MotionSource`."""

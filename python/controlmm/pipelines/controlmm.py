@@ -5,8 +5,9 @@ Source: Pinyoanuntapong et al., ControlMM / MaskControl, ICCV 2025.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -40,6 +41,7 @@ from controlmm.motion.normalizer import Normalizer
 from controlmm.nn.checkpoint import PretrainedModel
 from controlmm.pipelines.adjusting import adjusted
 from controlmm.pipelines.checks import check_masks_end, check_sizes
+from controlmm.pipelines.guidance import PUBLISHED, Guidance
 from controlmm.pipelines.motion_editing import run_edit
 from controlmm.pipelines.output import GenerationResult
 from controlmm.pipelines.pipeline import MotionPipeline
@@ -65,6 +67,7 @@ class ControlMM(MotionPipeline[Preset]):
         "residual_control": ResidualControl,
         "length": LengthEstimator,
     }
+    settings: ClassVar[Mapping[str, Callable[[Mapping[str, Any]], Any]]] = {"guidance": Guidance.of}
 
     def __init__(
         self,
@@ -77,6 +80,7 @@ class ControlMM(MotionPipeline[Preset]):
         text_encoder: TextEncoder,
         residual_control: ResidualControl | None = None,
         length: LengthEstimator | None = None,
+        guidance: Guidance = PUBLISHED,
     ) -> None:
         control.config.check_base(transformer.config)
         if residual_control is not None:
@@ -101,10 +105,13 @@ class ControlMM(MotionPipeline[Preset]):
         )
         self.decoder = MotionDecoder(tokenizer, normalizer)
         self.text_encoder = text_encoder
+        self.guidance = guidance
 
     def resolve_preset(self, preset: str | Preset, guidance_scale: float | None) -> Preset:
         """See :class:`MotionPipeline`."""
-        return resolve_preset(preset, guidance_scale=guidance_scale)
+        plan = resolve_preset(preset, guidance_scale=guidance_scale)
+        scales = self.guidance.under(plan)
+        return replace(plan, guidance_scale=scales.base, residual_guidance_scale=scales.residual)
 
     @torch.no_grad()
     def edit(
@@ -261,7 +268,7 @@ class ControlMM(MotionPipeline[Preset]):
                 valid[rows],
                 ClipNoise([seeds[row] for row in rows.tolist()]),
                 steps=preset.steps,
-                guidance_scale=preset.guidance_scale,
+                guidance_scale=self.guidance.under(preset).base,
                 rules=preset.rules,
                 progress=progress,
             )
@@ -303,7 +310,7 @@ class ControlMM(MotionPipeline[Preset]):
         control: ControlledLayers | None = None,
     ) -> Tensor:
         """All layers of codes: those of tokens that are kept, the others from the residual transformer."""
-        scale = preset.residual_guidance_scale
+        scale = self.guidance.under(preset).residual
         ids = fill_residual_layers(self.residual, base_ids, request, guidance_scale=scale, control=control)
         return ids if request.kept is None else request.kept.put_back(ids)
 

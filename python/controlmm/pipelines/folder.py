@@ -57,14 +57,20 @@ def read_json(path: Path) -> dict[str, Any]:
     return value
 
 
-def check_kind(folder: Path, kind: str) -> None:
-    """Raise ``ValueError`` unless ``folder`` holds a pipeline of ``kind`` in a format that we read."""
+def read_pipeline(folder: Path, kind: str) -> dict[str, Any]:
+    """What a pipeline's folder says about it.
+
+    Raises:
+        FileNotFoundError: If it says nothing.
+        ValueError: If it does not hold a pipeline of ``kind`` in a format that we read.
+    """
     about = read_json(folder / PIPELINE_FILE)
     if about.get("kind") != kind or about.get("format") != FORMAT:
         raise ValueError(
             f"{folder} holds a pipeline of kind {about.get('kind')!r}, format {about.get('format')!r}; "
             f"expected {kind!r}, format {FORMAT}."
         )
+    return about
 
 
 def write_json(path: Path, value: dict[str, Any]) -> None:

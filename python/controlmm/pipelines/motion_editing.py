@@ -76,7 +76,7 @@ def run_edit(
         torch.ones(ids.shape[:2], dtype=torch.bool),
         ClipNoise(clip_seeds(seed, samples)),
         steps=preset.steps,
-        guidance_scale=preset.guidance_scale,
+        guidance_scale=pipeline.guidance.under(preset).base,
         rules=preset.rules,
         progress=progress,
         kept=_kept_tokens(pipeline, scene, ids),

@@ -120,7 +120,7 @@ class MotionPipeline(PretrainedPipeline, ABC, Generic[_Plan]):
             samples: How many motions; sample ``i`` is the same however many are asked for.
             preset: ``fast``, ``balanced``, ``accurate``, one of the papers' (``paper-accurate``), or a preset
                 of one's own.
-            guidance_scale: How strongly the text counts; ``None`` takes the preset's.
+            guidance_scale: How strongly the text counts; ``None`` takes the preset's, or the model's.
             tolerance: Control error at which editing is done, in metres or as ``"1mm"``; ``None`` takes the
                 preset's.
             time_budget: Time for the editing of latents, in seconds or as ``"200ms"``. Results then depend on

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import torch
 
@@ -23,6 +24,8 @@ class PretrainedPipeline:
     # By the names of their folders, which are those of the constructor's arguments and of attributes.
     network_classes: ClassVar[Mapping[str, type[PretrainedModel]]]
     optional_networks: ClassVar[tuple[str, ...]] = ("length", "residual_control")
+    # Dataclasses that pipeline.json holds, by their names in it, which are the constructor's, too.
+    settings: ClassVar[Mapping[str, Callable[[Mapping[str, Any]], Any]]] = {}
     decoder: MotionDecoder
     text_encoder: TextEncoder
 
@@ -42,7 +45,7 @@ class PretrainedPipeline:
             ModuleNotFoundError: If the text encoder's weights are not installed.
         """
         folder = files.resolve_folder(path, shipped=cls.kind)
-        files.check_kind(folder, cls.kind)
+        about = files.read_pipeline(folder, cls.kind)
         encoder_config = files.read_json(folder / files.TEXT_ENCODER_FILE)
         if text_encoder is None:
             text_encoder = load_text_encoder(encoder_config)
@@ -55,7 +58,11 @@ class PretrainedPipeline:
         }
         normalizer = Normalizer.load(folder / files.NORMALIZER_FILE)
         assembled: Callable[..., Self] = cls  # every subclass takes its networks by these names
-        return assembled(**networks, normalizer=normalizer, text_encoder=text_encoder)
+        try:
+            settings = {name: read(about[name]) for name, read in cls.settings.items() if name in about}
+        except ValueError as error:
+            raise ValueError(f"{folder / files.PIPELINE_FILE}: {error}") from error
+        return assembled(**networks, normalizer=normalizer, text_encoder=text_encoder, **settings)
 
     def networks(self) -> dict[str, PretrainedModel]:
         """All networks by the names of their folders."""
@@ -80,5 +87,10 @@ class PretrainedPipeline:
             network.save_pretrained(folder / name, dtype=dtype)
         self.decoder.normalizer.save(folder / files.NORMALIZER_FILE)
         files.write_json(folder / files.TEXT_ENCODER_FILE, self.text_encoder.config())
-        files.write_json(folder / files.PIPELINE_FILE, {"kind": self.kind, "format": files.FORMAT})
+        about = {
+            "kind": self.kind,
+            "format": files.FORMAT,
+            **{name: asdict(getattr(self, name)) for name in self.settings},
+        }
+        files.write_json(folder / files.PIPELINE_FILE, about)
         return folder

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from controlmm.nn.checkpoint import CONFIG_FILE, WEIGHTS_FILE, PretrainedModel, read_weights
-from controlmm.pipelines.folder import PIPELINE_FILE, TEXT_ENCODER_FILE, check_kind, read_json
+from controlmm.pipelines.folder import PIPELINE_FILE, TEXT_ENCODER_FILE, read_json, read_pipeline
 from controlmm.text import check_same_encoder
 from controlmm.training.registry import load_stage
 from controlmm.training.run_folder import SETTINGS_FILE
@@ -32,7 +32,7 @@ def starting_folder(path: Path, stage: Stage) -> Path:
             "folder keeps. Train it from the beginning."
         )
     if (path / PIPELINE_FILE).is_file():
-        check_kind(path, stage.system)
+        read_pipeline(path, stage.system)
     for folder in (path, path / stage.network):
         if (folder / CONFIG_FILE).is_file() and (folder / WEIGHTS_FILE).is_file():
             return folder
