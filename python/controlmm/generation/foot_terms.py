@@ -13,10 +13,9 @@ from torch import Tensor
 from torch.nn.functional import smooth_l1_loss
 
 from controlmm.generation.motion_decoder import MotionDecoder
-from controlmm.motion.layout import feature_layout
+from controlmm.generation.resting_feet import in_contact, led_feet
 from controlmm.motion.skeleton import Skeleton
 
-_IS_CONTACT = 0.5  # of a contact channel, which is 1 at rest and 0 in motion
 _PUBLISHED_HEIGHT = 0.02  # metres: ankle and toe on average lower: the released code plants a foot
 
 
@@ -50,11 +49,8 @@ class ContactTerm:
         """
         skeleton = decoder.normalizer.skeleton
         features = decoder.features(latents, frames)
-        rests = features[..., feature_layout(skeleton).foot_contacts] > _IS_CONTACT
-        targeted = [
-            mask[:, :, list(foot)].flatten(2).any(2) for foot in (skeleton.left_foot, skeleton.right_foot)
-        ]
-        free = frames[..., None] & ~torch.stack(targeted, dim=-1).repeat_interleave(2, dim=-1)
+        rests = in_contact(features, skeleton)
+        free = frames[..., None] & ~led_feet(mask.any(-1), skeleton)
         rests[:, :-1] &= free[:, :-1] & free[:, 1:]  # a step has two frames
         rests[:, -1] = False
         return cls(rests, skeleton.foot_joints, weight)

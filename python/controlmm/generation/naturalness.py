@@ -16,11 +16,10 @@ from torch import Tensor, nn
 from torch.nn.functional import max_pool1d
 
 from controlmm.generation.motion_decoder import MotionDecoder
-from controlmm.motion.layout import feature_layout
+from controlmm.generation.resting_feet import in_contact, led_feet
 from controlmm.motion.skeleton import Skeleton
 from controlmm.ops import recover_joints
 
-_IS_CONTACT = 0.5  # of a contact channel, which is 1 at rest and 0 in motion
 _FLOOR_SECONDS = 0.5  # to each side: within it a foot touches the ground, unless a jump is high
 _MEANT_CLIMB = 0.5  # metres: a start that climbs by more means to (stairs), and its floor is left alone
 _VELOCITY, _JERK = 1, 3  # orders of differences in time
@@ -170,12 +169,7 @@ def _at_rest(
     skeleton: Skeleton,
 ) -> Bool[Tensor, "B T F"]:
     """Joints of feet without targets that the contact channels say rest in a frame and the next."""
-    in_contact = features[..., feature_layout(skeleton).foot_contacts] > _IS_CONTACT
-    feet = (skeleton.left_foot, skeleton.right_foot)
-    led = torch.stack([is_led[:, :, list(foot)].any(-1) for foot in feet], dim=-1).repeat_interleave(
-        2, dim=-1
-    )
-    stands = in_contact & ~led & frames[..., None]
+    stands = in_contact(features, skeleton) & ~led_feet(is_led, skeleton) & frames[..., None]
     rests = torch.zeros_like(stands)
     rests[:, :-1] = stands[:, :-1] & stands[:, 1:]
     return rests

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.objective import ControlObjective
+from controlmm.generation.resting_feet import in_contact
 from controlmm.generation.solvers import Progress, Stopping, lbfgs
 from controlmm.motion.layout import feature_layout
 from controlmm.motion.skeleton import Skeleton
@@ -24,7 +25,6 @@ from controlmm.ops import recover_joints
 # 4 would bring 0.115 and 4.8.
 _ITERATIONS = 3
 _WEIGHT = 15.0  # for each m^2 of squared steps; L-BFGS stops by absolute changes
-_IS_CONTACT = 0.5  # of a contact channel, which is 1 at rest and 0 in motion
 _NEAR_GROUND = 0.12  # metres: a foot in the air may go as it likes
 
 
@@ -60,7 +60,7 @@ class FootStepTerm:
         joints = recover_joints(features, joints=skeleton.num_joints)
         velocities = features[..., layout.joint_velocities].unflatten(-1, (-1, 3))[:, :, feet]
         steps = skeleton.metres * _in_world(velocities, features[..., layout.root_yaw_velocity])
-        rests = features[..., layout.foot_contacts] > _IS_CONTACT
+        rests = in_contact(features, skeleton)
         rests = rests[:, :-1] & rests[:, 1:]
         height = skeleton.metres * joints[:, :, feet, 1]
         is_near = torch.maximum(height[:, :-1], height[:, 1:]) < _NEAR_GROUND
