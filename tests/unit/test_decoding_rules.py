@@ -9,10 +9,10 @@ import torch
 
 from controlmm.controls import JointControl
 from controlmm.generation import masked_decoding
+from controlmm.generation.decoding_request import DecodingRequest
 from controlmm.generation.decoding_rules import DecodingRules, likeliest_share
 from controlmm.generation.editing import EditingBudget, edit_logits
 from controlmm.generation.masked_decoding import (
-    DecodingRequest,
     decode_from_text,
     decode_with_control,
     fill_residual_layers,
@@ -316,7 +316,7 @@ def test_residual_codes_are_the_likeliest_or_drawn(tiny_pipeline):
 @pytest.mark.parametrize("tokens", ["likeliest", "sampled"])
 def test_no_code_can_win_a_residual_layer_only_if_allowed(tiny_pipeline, monkeypatch, tokens):
     residual = tiny_pipeline.residual
-    logits = torch.zeros(1, 6, 33)
+    logits = torch.zeros(2, 6, 33)  # with and without text
     logits[..., 32] = 50.0  # PAD
     logits[..., 5] = 40.0
     monkeypatch.setattr(residual, "forward", lambda *_, **__: logits)

@@ -7,11 +7,11 @@ import math
 import pytest
 import torch
 
+from controlmm.generation.decoding_request import DecodingRequest
+from controlmm.generation.guided_logits import base_prediction, guided, residual_prediction
 from controlmm.generation.masked_decoding import (
-    DecodingRequest,
     decode_from_text,
     fill_residual_layers,
-    guided,
     lowest,
     masked_counts,
 )
@@ -57,10 +57,11 @@ def test_lowest_scores_are_found_for_each_clip_and_ties_go_by_position():
 def test_guidance_moves_away_from_the_prediction_without_text():
     asked = request([3], scale=4.0)
 
-    def predict(text):
-        return text.sum() * torch.ones(1, 3, 2) + 1.0
+    def predict(rows, length, text):
+        return text.sum(1)[:, None, None] * torch.ones(len(rows), length, 2) + 1.0
 
-    with_text, without = predict(asked.text), predict(torch.zeros(1, 64))
+    row = torch.tensor([0])
+    with_text, without = predict(row, 3, asked.text), predict(row, 3, torch.zeros(1, 64))
     torch.testing.assert_close(guided(predict, asked), without + 4 * (with_text - without))
     torch.testing.assert_close(guided(predict, asked, scale=1.0), with_text)
     torch.testing.assert_close(guided(predict, asked, scale=0.0), without)
@@ -104,7 +105,7 @@ def test_text_decoding_draws_only_from_the_likeliest_tenth(tiny_pipeline):
     """With one step every id comes from the first logits, of which ceil(0.1 * 32) = 4 can be drawn."""
     transformer, asked = tiny_pipeline.transformer, request([12], steps=1)
     hidden = transformer.embed(torch.full((1, 12), transformer.mask_id))
-    logits = guided(lambda text: transformer(hidden, text, asked.valid), asked)
+    logits = guided(base_prediction(transformer, hidden), asked)
     ids = decode_from_text(transformer, asked)
     assert (logits.topk(4, dim=-1).indices == ids[..., None]).any(-1).all()
 
@@ -125,10 +126,7 @@ def test_residual_layers_are_the_likeliest_codes_given_the_layers_before(tiny_pi
     for layer in (1, 2):
         number = torch.full((2,), layer)
         known = torch.where(torch.arange(3) < layer, ids, -1)
-        logits = guided(
-            lambda text, k=known, n=number: residual(residual.history(k, n), n, text, asked.valid),
-            asked,
-            scale=5.0,
-        )
+        predict = residual_prediction(residual, residual.history(known, number), number, None)
+        logits = guided(predict, asked, scale=5.0)
         expected = logits[..., :32].argmax(-1)  # PAD, number 32, is never a choice
         assert torch.equal(ids[..., layer][asked.valid], expected[asked.valid])

@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from controlmm.controls import Avoid, JointControl, Objective, PathControl, Sphere, penetration, yaw_matrix
+from controlmm.generation.decoding_request import DecodingRequest
 from controlmm.generation.editing import EditingBudget
 from controlmm.generation.kept_tokens import KeptTokens
-from controlmm.generation.masked_decoding import DecodingRequest, decode_from_text
+from controlmm.generation.masked_decoding import decode_from_text
 from controlmm.generation.noise import ClipNoise
 from controlmm.generation.objective import ControlObjective
 from controlmm.generation.variation import vary_tokens

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from controlmm.evaluation.controlmm_tables import without_control_model
 from controlmm.evaluation.motion_sources import Batch
+from controlmm.generation.decoding_request import DecodingRequest
 from controlmm.generation.editing import EditingBudget
-from controlmm.generation.masked_decoding import DecodingRequest, decode_from_text, decode_with_control
+from controlmm.generation.masked_decoding import decode_from_text, decode_with_control
 from controlmm.generation.noise import ClipNoise
 from controlmm.generation.objective import ControlObjective
 from controlmm.models.rvq_vae import frame_mask

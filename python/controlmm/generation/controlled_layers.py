@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from controlmm.generation.kept_tokens import KeptTokens
 from controlmm.generation.motion_decoder import MotionDecoder
+from controlmm.generation.partial_decoder import PartialDecoder, controlled_joints
 from controlmm.models.residual_control import ResidualControl
 
 
@@ -23,6 +24,12 @@ class ControlledLayers:
     mask: Bool[Tensor, "B T J 3"]
     base: Float[Tensor, "B L C"]  # latents of the base layer, which may be a mean of codes
     kept: KeptTokens | None = None  # of a motion that is there
+    part: PartialDecoder | None = None  # says where joints are, instead of the decoder; see `quick`
+
+    def quick(self, frames: Bool[Tensor, "B T"], dtype: torch.dtype) -> ControlledLayers:
+        """The same without gradients: only joints that count are decoded, with products in ``dtype``."""
+        joints = sorted({*controlled_joints(self.mask), *self.decoder.normalizer.skeleton.facing})
+        return replace(self, part=PartialDecoder(self.decoder, joints, frames, dtype=dtype))
 
     def hints(
         self, ids: Int[Tensor, "B L Q"], layer: Int[Tensor, "B"], valid: Bool[Tensor, "B L"]
@@ -30,12 +37,13 @@ class ControlledLayers:
         """For the residual transformer that predicts ``layer``; ``ids`` are -1 in layers that are to come."""
         if self.kept is not None:
             ids = self.kept.put_back(ids)
-        finer = self.decoder.tokenizer.quantizer.lookup(without_base(ids))
-        frames = valid.repeat_interleave(self.decoder.downsample, dim=1)
-        current = self.decoder(self.base + finer, frames)
-        hints: list[Tensor] = self.network(
-            self.network.signal(self.targets, self.mask, current), layer, valid
-        )
+        latents = self.base + self.decoder.tokenizer.quantizer.lookup(without_base(ids))
+        if self.part is None:
+            current = self.decoder(latents, valid.repeat_interleave(self.decoder.downsample, dim=1))
+        else:
+            current = self.part.positions(latents)
+        signal = self.network.signal(self.targets, self.mask, current)
+        hints: list[Tensor] = self.network(signal, layer, valid)
         return hints
 
 

@@ -8,17 +8,26 @@ and with any number of threads.
 
 from __future__ import annotations
 
+import os
+from typing import Literal
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 _TYPICAL_ROWS = 196  # the frames of one clip: what packing prepares for
+# Wider products in bfloat16 are sums of narrower ones: oneDNN would sum a row in an order that depends on how
+# many rows there are.
+_WIDEST_BFLOAT16 = 256
+
+Activation = Literal["none", "relu", "gelu"]
 
 
 def has_fast_bfloat16() -> bool:
-    """Whether this processor multiplies bfloat16 matrices in tiles (AMX)."""
+    """Whether this processor multiplies bfloat16 in tiles (AMX), and ``CONTROLMM_BFLOAT16`` is not 0."""
     return (
-        bool(torch.cpu._is_amx_tile_supported())
+        os.environ.get("CONTROLMM_BFLOAT16") != "0"
+        and bool(torch.cpu._is_amx_tile_supported())
         and _packed(torch.zeros(16, 16, dtype=torch.bfloat16)) is not None
     )
 
@@ -29,23 +38,48 @@ class FrozenMatrix:
     def __init__(
         self, weight: Float[Tensor, "out in"], bias: Float[Tensor, "out"] | None, dtype: torch.dtype
     ) -> None:
-        weight = weight.detach().to(dtype).contiguous()
+        weight = weight.detach().to(dtype)
         self._bias = None if bias is None else bias.detach().to(dtype)
-        self._columns = weight.t().contiguous()
-        self._packed = _packed(weight)
+        count = -(-weight.shape[1] // _WIDEST_BFLOAT16) if dtype == torch.bfloat16 else 1
+        self._widths = [part.shape[1] for part in weight.tensor_split(count, dim=1)]
+        self._parts = [_Columns(part.contiguous()) for part in weight.split(self._widths, dim=1)]
 
     def __call__(
-        self, x: Float[Tensor, "N in"], *, is_rectified: bool = False, is_tangent: bool = False
-    ) -> Tensor:
-        """The product; rectified, or without the bias."""
+        self, x: Float[Tensor, "N in"], *, activation: Activation = "none", is_tangent: bool = False
+    ) -> Float[Tensor, "N out"]:
+        """The product after an activation; of a tangent: without the bias."""
         bias = None if is_tangent else self._bias
-        if self._packed is not None:
-            result: Tensor = torch.ops.mkldnn._linear_pointwise(
-                x, self._packed, bias, "relu" if is_rectified else "none", [], ""
-            )
-            return result
-        result = x @ self._columns if bias is None else torch.addmm(bias, x, self._columns)
-        return result.clamp_min_(0) if is_rectified else result
+        first, *others = self._parts
+        if not others:
+            return first.product(x, bias, activation)
+        inputs = x.split(self._widths, dim=1)
+        total = first.product(inputs[0], bias).float()
+        for part, columns in zip(inputs[1:], others, strict=True):
+            total += columns.product(part, None)
+        return _activated(total, activation).to(x.dtype)
+
+
+class _Columns:
+    """Some columns of a matrix, packed where this torch and processor can."""
+
+    def __init__(self, weight: Float[Tensor, "out in"]) -> None:
+        self._packed = _packed(weight)
+        self._transposed = weight.t().contiguous() if self._packed is None else None
+
+    def product(self, x: Tensor, bias: Tensor | None, activation: Activation = "none") -> Tensor:
+        if self._transposed is not None:
+            plain = x @ self._transposed if bias is None else torch.addmm(bias, x, self._transposed)
+            return _activated(plain, activation)
+        algorithm = "none" if activation == "gelu" else ""
+        product = torch.ops.mkldnn._linear_pointwise
+        result: Tensor = product(x, self._packed, bias, activation, [], algorithm)
+        return result
+
+
+def _activated(x: Tensor, activation: Activation) -> Tensor:
+    if activation == "relu":
+        return x.clamp_min_(0)
+    return nn.functional.gelu(x) if activation == "gelu" else x
 
 
 def _packed(weight: Tensor) -> Tensor | None:
@@ -81,7 +115,8 @@ class FrozenConv:
         self, x: Float[Tensor, "B T C"], *, is_rectified: bool = False, is_tangent: bool = False
     ) -> Float[Tensor, "B T D"]:
         """The convolution, rectified if asked for; of a tangent: without the bias."""
-        product = self._forward(self._rows(x), is_rectified=is_rectified, is_tangent=is_tangent)
+        activation: Activation = "relu" if is_rectified else "none"
+        product = self._forward(self._rows(x), activation=activation, is_tangent=is_tangent)
         result: Tensor = product.unflatten(0, x.shape[:2])
         return result
 

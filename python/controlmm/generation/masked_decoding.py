@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import partial
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from controlmm.generation.controlled_layers import ControlledLayers, without_base
-from controlmm.generation.decoding_rules import DecodingRules, likeliest_share
+from controlmm.generation.decoding_request import DecodingRequest
+from controlmm.generation.decoding_rules import likeliest_share
 from controlmm.generation.editing import EditingBudget, edit_logits
-from controlmm.generation.kept_tokens import KeptTokens
+from controlmm.generation.guided_logits import (
+    base_prediction,
+    controlled_prediction,
+    guided,
+    residual_prediction,
+)
 from controlmm.generation.motion_decoder import MotionDecoder
-from controlmm.generation.noise import ClipNoise
 from controlmm.generation.objective import ControlObjective
-from controlmm.generation.solvers import Progress
+from controlmm.generation.partial_decoder import PartialDecoder, controlled_joints
 from controlmm.generation.token_mixture import token_mixture
 from controlmm.models.control_branch import ControlBranch
 from controlmm.models.masked_transformer import MaskedTransformer
@@ -27,43 +29,6 @@ from controlmm.models.tokenizer import MotionTokenizer
 
 DECIDED = 1e5  # confidence of tokens that are never masked again
 _RESIDUAL_TOP_SHARE = 0.1  # of the codes can be drawn in residual layers that are drawn
-
-
-@dataclass(frozen=True)
-class DecodingRequest:
-    """A batch of clips to decode, padded to the longest."""
-
-    text: Float[Tensor, "B E"]
-    valid: Bool[Tensor, "B L"]
-    noise: ClipNoise
-    steps: int = 10
-    guidance_scale: float = 4.0
-    rules: DecodingRules = field(default_factory=DecodingRules)
-    progress: Progress | None = None
-    watch: Callable[[int, Float[Tensor, "B L"]], None] | None = None  # (step, confidence of every token)
-    kept: KeptTokens | None = None  # of a motion that is there; the others are drawn
-
-    @property
-    def lengths(self) -> list[int]:
-        """Tokens of each clip."""
-        counts: list[int] = self.valid.sum(1).tolist()
-        return counts
-
-    @property
-    def drawn(self) -> Bool[Tensor, "B L"]:
-        """Which tokens are drawn."""
-        return self.valid if self.kept is None else self.valid & ~self.kept.where
-
-    def gumbel(self, width: int) -> Float[Tensor, "B L K"]:
-        """Fresh noise for every token of every clip."""
-        return self.noise.gumbel(self.lengths, padded=self.valid.shape[1], width=width)
-
-    def report(self, step: int, confidence: Float[Tensor, "B L"]) -> None:
-        """Tell the caller that ``step`` steps are done, and how sure the model was of what it drew."""
-        if self.progress is not None:
-            self.progress("masked decoding", step, self.steps)
-        if self.watch is not None:
-            self.watch(step, confidence)
 
 
 def decode_from_text(base: MaskedTransformer, request: DecodingRequest) -> Int[Tensor, "B L"]:
@@ -79,7 +44,7 @@ def decode_from_text(base: MaskedTransformer, request: DecodingRequest) -> Int[T
     for step in range(request.steps):
         hidden = lowest(scores, masked_counts(request, step))
         ids = torch.where(hidden, base.mask_id, ids)
-        logits = guided(partial(base, base.embed(ids), valid=valid), request)
+        logits = guided(base_prediction(base, base.embed(ids)), request)
         allowed = likeliest_share(logits, request.rules.text_top_share)
         drawn = (allowed + request.gumbel(logits.shape[-1])).argmax(-1)
         ids = torch.where(hidden, drawn, ids)
@@ -108,6 +73,7 @@ def decode_with_control(
     valid, codes, rules, kept = request.valid, decoder.tokenizer.base_codes, request.rules, request.kept
     keep = valid[..., None].float()
     frames = valid.repeat_interleave(decoder.downsample, dim=1)
+    part = PartialDecoder(decoder, controlled_joints(objective.mask), frames, dtype=request.dtype)
     mask_embedding, mean_code = base.token_embedding.weight[base.mask_id], codes.mean(0)
     logits = torch.ones(*valid.shape, len(codes))
     embedded = mask_embedding.expand(*valid.shape, -1)
@@ -119,12 +85,12 @@ def decode_with_control(
         hidden = lowest(scores, masked_counts(request, step))[..., None]
         embedded = torch.where(hidden, mask_embedding, embedded)
         if branch is None:
-            logits = guided(partial(base, embedded, valid=valid), request)
+            logits = guided(base_prediction(base, embedded), request)
         else:
             latents = torch.where(hidden, mean_code, logits.softmax(-1) @ codes) * keep
-            signal = branch.signal(objective.targets, objective.mask, decoder(latents, frames))
+            signal = branch.signal(objective.targets, objective.mask, part.positions(latents))
             hint = branch.hint(signal, valid)
-            logits = guided(partial(_controlled_logits, base, branch, embedded, hint, valid), request)
+            logits = guided(controlled_prediction(base, branch, embedded, hint), request)
         if kept is not None:
             logits = kept.certain(logits)
         if budget.logits_iterations:
@@ -149,17 +115,6 @@ def decode_with_control(
     return logits
 
 
-def _controlled_logits(
-    base: MaskedTransformer,
-    branch: ControlBranch,
-    embedded: Float[Tensor, "B L E"],
-    hint: Float[Tensor, "B S W"],
-    valid: Bool[Tensor, "B L"],
-    text: Float[Tensor, "B D"],
-) -> Float[Tensor, "B L K"]:
-    return branch.hinted_logits(base, base.sequence(embedded, text), hint, valid)
-
-
 def fill_residual_layers(
     residual: ResidualTransformer,
     base_ids: Int[Tensor, "B L"],
@@ -180,7 +135,7 @@ def fill_residual_layers(
         ids = torch.stack(layers + [missing] * (residual.config.num_quantizers - layer), dim=-1)
         history = residual.history(ids, number)
         hints = None if control is None else control.hints(ids, number, request.valid)
-        predict = partial(residual, history, number, valid=request.valid, hints=hints)
+        predict = residual_prediction(residual, history, number, hints)
         logits = guided(predict, request, scale=guidance_scale)
         if not request.rules.pad_class:
             logits = logits[..., : residual.pad_id]  # a valid position always has a code
@@ -218,21 +173,6 @@ def final_latents(
         return tokenizer.quantizer.lookup(ids)
     soft = token_mixture(logits) @ tokenizer.base_codes * request.valid[..., None]
     return soft + tokenizer.quantizer.lookup(without_base(ids))
-
-
-def guided(
-    predict: Callable[[Float[Tensor, "B E"]], Float[Tensor, "B L K"]],
-    request: DecodingRequest,
-    *,
-    scale: float | None = None,
-) -> Float[Tensor, "B L K"]:
-    """Classifier-free guidance: ``l_0 + s (l_text - l_0)``, where "no text" is the zero vector."""
-    scale = request.guidance_scale if scale is None else scale
-    with_text = predict(request.text)
-    if scale == 1:
-        return with_text
-    without = predict(torch.zeros_like(request.text))
-    return without + scale * (with_text - without)
 
 
 def masked_counts(request: DecodingRequest, step: int) -> Int[Tensor, "B"]:

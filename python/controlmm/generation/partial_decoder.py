@@ -9,8 +9,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from controlmm.generation.clip_groups import clips_by_length
 from controlmm.generation.frozen_decoder import FrozenDecoder, Tape
 from controlmm.generation.motion_decoder import MotionDecoder
+from controlmm.ops import recover_joints
 
 
 def controlled_joints(mask: Bool[Tensor, "B T J 3"]) -> tuple[int, ...]:
@@ -53,10 +55,7 @@ class PartialDecoder:
         channels = list(self.channels)
         self.mean, self.std = decoder.normalizer.mean[channels], decoder.normalizer.std[channels]
         self._frozen: FrozenDecoder = decoder.frozen(dtype)
-        tokens = frames[:, :: decoder.downsample].sum(1)
-        self.groups: list[tuple[int, Int[Tensor, "N"]]] = [
-            (length, (tokens == length).nonzero()[:, 0]) for length in tokens.unique().tolist()
-        ]
+        self.groups = clips_by_length(frames[:, :: decoder.downsample].sum(1).tolist())
 
     def select(self, clips: Int[Tensor, "S"]) -> PartialDecoder:
         """The same for some of the clips."""
@@ -72,6 +71,14 @@ class PartialDecoder:
             features[rows, : length * step] = decoded
             tapes.append(tape)
         return Decoded(features, tuple(tapes))
+
+    def positions(self, latents: Float[Tensor, "B L C"]) -> Float[Tensor, "B T J 3"]:
+        """Global positions of the wanted joints, zero for the others."""
+        features = self.decode(latents).features * self.std + self.mean
+        found = recover_joints(features, joints=len(self.joints))
+        positions = found.new_zeros(*found.shape[:2], self.decoder.normalizer.skeleton.num_joints, 3)
+        positions[:, :, list(self.joints)] = found
+        return positions
 
     def pull(self, decoded: Decoded, gradient: Float[Tensor, "B T D"]) -> Float[Tensor, "B L C"]:
         """The gradient in the latents, given that in the features of :meth:`decode`."""

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from controlmm.generation.decoding_request import DecodingRequest
 from controlmm.generation.decoding_rules import likeliest_share
-from controlmm.generation.masked_decoding import DECIDED, DecodingRequest, guided, lowest
+from controlmm.generation.guided_logits import base_prediction, guided
+from controlmm.generation.masked_decoding import DECIDED, lowest
 from controlmm.models.masked_transformer import MaskedTransformer
 
 VARIED_SHARE = 0.16  # of the tokens that each step draws anew: MoMask's, without an edit mask
@@ -34,7 +34,7 @@ def vary_tokens(
 
 
 def _logits(base: MaskedTransformer, request: DecodingRequest, ids: Int[Tensor, "B L"]) -> Tensor:
-    return guided(partial(base, base.embed(ids), valid=request.valid), request)
+    return guided(base_prediction(base, base.embed(ids)), request)
 
 
 def _certainty(logits: Float[Tensor, "B L K"], ids: Int[Tensor, "B L"]) -> Float[Tensor, "B L"]:

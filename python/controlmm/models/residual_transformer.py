@@ -174,8 +174,15 @@ class ResidualTransformer(PretrainedModel):
         sequence = torch.cat([text_token, layer_token, tokens], dim=1)
         hidden = run_layers(self.layers, sequence, with_text_token(valid, 2), hints)
         predicted: Tensor = self.head(hidden[:, 2:])
-        logits = torch.einsum("ble,bre->blr", predicted, self.output_tables()[layer - 1])
+        logits = self._scores(predicted, layer)
         return logits if self.config.shares_tables else logits + self.output_bias[layer - 1][:, None]
+
+    def _scores(self, predicted: Float[Tensor, "B L E"], layer: Int[Tensor, "B"]) -> Float[Tensor, "B L R"]:
+        """Products with the rows of each clip's table."""
+        tables = self.output_tables()
+        if (layer == layer[0]).all():  # as in generation: no copy of the table for every clip
+            return predicted @ tables[layer[0] - 1].T
+        return torch.einsum("ble,bre->blr", predicted, tables[layer - 1])
 
 
 def _fresh_tables(count: int, rows: int, dim: int) -> nn.Parameter:

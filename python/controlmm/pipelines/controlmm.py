@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,9 +15,10 @@ from torch import Tensor, nn
 
 from controlmm.controls import Avoid, Control, Objective, Obstacle
 from controlmm.generation.controlled_layers import ControlledLayers
+from controlmm.generation.decoding_request import DecodingRequest
+from controlmm.generation.frozen_layers import has_fast_bfloat16
 from controlmm.generation.latent_editing import edit_latents
 from controlmm.generation.masked_decoding import (
-    DecodingRequest,
     decode_from_text,
     decode_with_control,
     fill_residual_layers,
@@ -27,6 +28,7 @@ from controlmm.generation.masked_decoding import (
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.noise import ClipNoise
 from controlmm.generation.objective import ControlObjective
+from controlmm.generation.packed_networks import PackedCopies
 from controlmm.generation.planted_feet import with_planted_feet
 from controlmm.generation.solvers import Progress
 from controlmm.generation.terms import JointTerm
@@ -47,6 +49,8 @@ from controlmm.pipelines.output import GenerationResult
 from controlmm.pipelines.pipeline import MotionPipeline
 from controlmm.pipelines.presets import Preset, resolve_preset, with_limits
 from controlmm.text import TextEncoder
+
+_Network = TypeVar("_Network", bound=nn.Module)
 
 
 class ControlMM(MotionPipeline[Preset]):
@@ -106,6 +110,7 @@ class ControlMM(MotionPipeline[Preset]):
         self.decoder = MotionDecoder(tokenizer, normalizer)
         self.text_encoder = text_encoder
         self.guidance = guidance
+        self._packed = PackedCopies()
 
     def resolve_preset(self, preset: str | Preset, guidance_scale: float | None) -> Preset:
         """See :class:`MotionPipeline`."""
@@ -271,6 +276,7 @@ class ControlMM(MotionPipeline[Preset]):
                 guidance_scale=self.guidance.under(preset).base,
                 rules=preset.rules,
                 progress=progress,
+                dtype=self.drawing_dtype(preset),
             )
 
         free, controlled = (~is_controlled).nonzero()[:, 0], is_controlled.nonzero()[:, 0]
@@ -298,8 +304,17 @@ class ControlMM(MotionPipeline[Preset]):
             latents[rows] = edit_latents(objective, drawn, keep, preset.budget, progress=progress).latents
         return latents
 
+    def drawing_dtype(self, preset: Preset) -> torch.dtype:
+        """In which the networks that draw tokens multiply. Published ones keep to what they were made in."""
+        is_ours = self.control.config.has_observation_mask
+        return torch.bfloat16 if preset.is_bfloat16 and is_ours and has_fast_bfloat16() else torch.float32
+
+    def packed(self, network: _Network, dtype: torch.dtype) -> _Network:
+        """A quicker copy of one of the networks, see :mod:`controlmm.generation.packed_networks`."""
+        return self._packed.of(network, dtype)
+
     def _from_text(self, request: DecodingRequest, preset: Preset) -> Tensor:
-        base_ids = decode_from_text(self.transformer, request)
+        base_ids = decode_from_text(self.packed(self.transformer, request.dtype), request)
         return self.decoder.tokenizer.quantizer.lookup(self._filled(base_ids, request, preset))
 
     def _filled(
@@ -311,7 +326,8 @@ class ControlMM(MotionPipeline[Preset]):
     ) -> Tensor:
         """All layers of codes: those of tokens that are kept, the others from the residual transformer."""
         scale = self.guidance.under(preset).residual
-        ids = fill_residual_layers(self.residual, base_ids, request, guidance_scale=scale, control=control)
+        residual = self.packed(self.residual, request.dtype)
+        ids = fill_residual_layers(residual, base_ids, request, guidance_scale=scale, control=control)
         return ids if request.kept is None else request.kept.put_back(ids)
 
     def refined_latents(
@@ -353,8 +369,8 @@ class ControlMM(MotionPipeline[Preset]):
         preset: Preset,
     ) -> Tensor:
         logits = decode_with_control(
-            self.transformer,
-            branch,
+            self.packed(self.transformer, request.dtype),
+            None if branch is None else self.packed(branch, request.dtype),
             self.decoder,
             objective,
             request,
@@ -364,9 +380,10 @@ class ControlMM(MotionPipeline[Preset]):
         control = None
         if branch is not None and self.residual_control is not None:
             base = final_latents(self.decoder.tokenizer, logits, base_ids[..., None], request)
+            network = self.packed(self.residual_control, request.dtype)
             control = ControlledLayers(
-                self.residual_control, self.decoder, objective.targets, objective.mask, base, request.kept
-            )
+                network, self.decoder, objective.targets, objective.mask, base, request.kept
+            ).quick(objective.frames, request.dtype)
         ids = self._filled(base_ids, request, preset, control)
         return final_latents(self.decoder.tokenizer, logits, ids, request)
 

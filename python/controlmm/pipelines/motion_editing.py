@@ -12,9 +12,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from controlmm.controls import Avoid, Control, Objective, Obstacle, penetration
+from controlmm.generation.decoding_request import DecodingRequest
 from controlmm.generation.kept_tokens import KeptTokens
 from controlmm.generation.latent_editing import edit_latents
-from controlmm.generation.masked_decoding import DecodingRequest, fill_residual_layers
+from controlmm.generation.masked_decoding import fill_residual_layers
 from controlmm.generation.noise import ClipNoise, clip_seeds
 from controlmm.generation.objective import ControlObjective, control_error
 from controlmm.generation.solvers import Progress
@@ -80,6 +81,7 @@ def run_edit(
         rules=preset.rules,
         progress=progress,
         kept=_kept_tokens(pipeline, scene, ids),
+        dtype=pipeline.drawing_dtype(preset),
     )
     terms = scene.terms(samples, padded)
     latents = _drawn(pipeline, scene, request, ids, terms, preset)
@@ -119,8 +121,10 @@ def _drawn(
 ) -> Float[Tensor, "B L C"]:
     """Latents that follow the text, parts and controls, among the tokens that are kept."""
     if not scene.kept.any():
-        base_ids = vary_tokens(pipeline.transformer, request, ids[..., 0])
-        varied = fill_residual_layers(pipeline.residual, base_ids, request, guidance_scale=_RESIDUAL_GUIDANCE)
+        base = pipeline.packed(pipeline.transformer, request.dtype)
+        residual = pipeline.packed(pipeline.residual, request.dtype)
+        base_ids = vary_tokens(base, request, ids[..., 0])
+        varied = fill_residual_layers(residual, base_ids, request, guidance_scale=_RESIDUAL_GUIDANCE)
         is_same = (base_ids == ids[..., 0])[..., None]
         return pipeline.decoder.tokenizer.quantizer.lookup(torch.where(is_same, ids, varied))
     if request.kept is not None:

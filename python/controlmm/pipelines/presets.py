@@ -28,6 +28,7 @@ class Preset:
     is_exact: bool = (
         False  # after editing, move the joints onto their targets; see controlmm.generation.exact
     )
+    is_bfloat16: bool = False  # networks that draw tokens multiply in bfloat16 where the processor has AMX
 
     def __post_init__(self) -> None:
         if isinstance(self.steps, bool) or not isinstance(self.steps, int) or self.steps < 1:
@@ -44,7 +45,7 @@ class Preset:
 def _ours(iterations: int, tolerance: float, *, is_exact: bool = False) -> Preset:
     """Editing until a tolerance, with naturalness."""
     budget = EditingBudget(solver="auto", latent_iterations=iterations, tolerance=tolerance, naturalness=1.0)
-    return Preset(budget, is_exact=is_exact)
+    return Preset(budget, is_exact=is_exact, is_bfloat16=True)
 
 
 # `python -m benchmarks.editing` measures them. The papers' iteration counts are there to compare with.

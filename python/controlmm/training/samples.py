@@ -14,9 +14,9 @@ from torch.nn.utils.rnn import pad_sequence
 
 from controlmm.data.clip import FeatureClip
 from controlmm.generation.controlled_layers import ControlledLayers
+from controlmm.generation.decoding_request import DecodingRequest
 from controlmm.generation.editing import EditingBudget
 from controlmm.generation.masked_decoding import (
-    DecodingRequest,
     decode_from_text,
     decode_with_control,
     fill_residual_layers,
