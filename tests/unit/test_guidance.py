@@ -11,7 +11,7 @@ import pytest
 from controlmm import ControlMM
 from controlmm.pipelines import PRESETS
 from controlmm.pipelines.folder import shipped_folder
-from controlmm.pipelines.guidance import Guidance
+from controlmm.pipelines.guidance import TRAINED_HERE, Guidance
 from controlmm.text import HashingTextEncoder
 
 TEXT = HashingTextEncoder(64)
@@ -57,8 +57,8 @@ def test_a_folder_keeps_them(tiny_pipeline, tmp_path):
     ("stored", "message"),
     [
         ({"base": "2"}, "`base` of the guidance must be a finite number, got '2'"),
-        ({"base": 2.0, "text": 1.0}, "`guidance` has the scales base and residual, got text, too"),
-        (3.0, "pipeline.json: `guidance` must hold the scales base and residual, got 3.0"),
+        ({"base": 2.0, "text": 1.0}, "`guidance` has the scales base, residual, control; got text, too"),
+        (3.0, "pipeline.json: `guidance` must hold the scales base, residual and control, got 3.0"),
     ],
 )
 def test_a_folder_with_other_scales_is_refused(tiny_pipeline, tmp_path, stored, message):
@@ -71,4 +71,4 @@ def test_a_folder_with_other_scales_is_refused(tiny_pipeline, tmp_path, stored, 
 
 def test_the_model_that_ships_has_its_own():
     about = json.loads((shipped_folder() / "pipeline.json").read_text())
-    assert Guidance.of(about["guidance"]) == Guidance(2.0, 3.0)
+    assert Guidance.of(about["guidance"]) == TRAINED_HERE

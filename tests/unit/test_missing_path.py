@@ -80,6 +80,17 @@ def test_the_residual_layers_see_what_is_missing_its_speed_and_the_mask(walking_
     assert torch.equal(network.signal(targets, mask, current), expected)
 
 
+def test_strength_counts_for_the_speed_alone(walking_joints):
+    network = ResidualControl(ResidualControlConfig.tiny())
+    current, (targets, mask) = walking_joints[:16].float()[None], goals(16)
+    plain = network.signal(targets, mask, current).chunk(3, dim=-1)
+    strong = network.signal(targets, mask, current, strength=4.0).chunk(3, dim=-1)
+    assert plain[1].any()
+    assert torch.equal(strong[1], 4 * plain[1])
+    assert strong[0].equal(plain[0])
+    assert strong[2].equal(plain[2])
+
+
 @pytest.mark.parametrize("has_mask", [True, False])
 @pytest.mark.parametrize("sees_speed", [True, False])
 def test_the_control_branch_sees_differences_targets_and_what_its_configuration_adds(

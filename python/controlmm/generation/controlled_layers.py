@@ -24,6 +24,7 @@ class ControlledLayers:
     mask: Bool[Tensor, "B T J 3"]
     base: Float[Tensor, "B L C"]  # latents of the base layer, which may be a mean of codes
     kept: KeptTokens | None = None  # of a motion that is there
+    strength: float = 1.0  # of the speed that would bring what is missing
     part: PartialDecoder | None = None  # says where joints are, instead of the decoder; see `quick`
 
     def quick(self, frames: Bool[Tensor, "B T"], dtype: torch.dtype) -> ControlledLayers:
@@ -42,7 +43,7 @@ class ControlledLayers:
             current = self.decoder(latents, valid.repeat_interleave(self.decoder.downsample, dim=1))
         else:
             current = self.part.positions(latents)
-        signal = self.network.signal(self.targets, self.mask, current)
+        signal = self.network.signal(self.targets, self.mask, current, strength=self.strength)
         hints: list[Tensor] = self.network(signal, layer, valid)
         return hints
 

@@ -102,6 +102,8 @@ class ResidualControl(PretrainedModel):
         targets: Float[Tensor, "B T J 3"],
         mask: Bool[Tensor, "B T J 3"],
         current: Float[Tensor, "B T J 3"],
+        *,
+        strength: float = 1.0,
     ) -> Float[Tensor, "B T S"]:
         """What is missing (metres), the speed that would bring it (m/s), and which coordinates have targets.
 
@@ -111,12 +113,14 @@ class ResidualControl(PretrainedModel):
             targets: Global positions to reach, in the skeleton's unit.
             mask: Which coordinates are controlled.
             current: Positions of the motion decoded from the layers so far.
+            strength: Factor of the speed. A network that was trained with 1 answers a miss with a part of
+                what it takes, as training pulls it to natural codes, too; told of more, it does more.
         """
         joints = list(self.config.joints)
         missing, speed = missing_in_heading(
             targets, mask, current, metres=self.config.signal_scale, fps=self.config.fps
         )
-        parts = [missing, speed, mask.to(current.dtype)]
+        parts = [missing, strength * speed, mask.to(current.dtype)]
         return torch.cat([part[:, :, joints].flatten(2) for part in parts], dim=-1)
 
     def forward(

@@ -382,7 +382,13 @@ class ControlMM(MotionPipeline[Preset]):
             base = final_latents(self.decoder.tokenizer, logits, base_ids[..., None], request)
             network = self.packed(self.residual_control, request.dtype)
             control = ControlledLayers(
-                network, self.decoder, objective.targets, objective.mask, base, request.kept
+                network,
+                self.decoder,
+                objective.targets,
+                objective.mask,
+                base,
+                request.kept,
+                strength=self.guidance.control,
             ).quick(objective.frames, request.dtype)
         ids = self._filled(base_ids, request, preset, control)
         return final_latents(self.decoder.tokenizer, logits, ids, request)
