@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import statistics
 
 import pytest
 import torch
@@ -127,19 +128,43 @@ def test_tracks_are_made_apart_and_see_the_controls_of_their_joints(tiny_pipelin
     assert not torch.equal(call["text"][1], call["text"][2])
     assert [sorted(set(clip.nonzero()[:, 1].tolist())) for clip in call["mask"]] == [[0], [0], [], []]
     torch.testing.assert_close(call["targets"][0, 59, 0], torch.tensor([0.0, 0.0, 2.0]))
-    blind = tiny_pipeline.timeline(entries, preset=SOLVED, seed=1).best
-    for frame, joint, place in ((59, 0, [1.0, 0.0, 4.0]), (30, 21, [1.0, 1.3, 3.0])):
-        off = [(m.joints[frame, joint] - torch.tensor(place))[[0, 2]].norm() for m in (*result, blind)]
-        assert max(off[:2]) < 0.7 * off[2]  # an untrained model has steps to hold that lead elsewhere
     assert result.best.num_frames == 60
     assert result.best.extra["timeline"] == tuple(entries)
 
 
+def test_tracks_come_nearer_to_the_targets_than_without_them(tiny_pipeline):
+    """An untrained model has steps to hold that lead elsewhere, in some samples far: so the median."""
+    entries = [
+        TimelineEntry("lower", "a person walks", frames=(0, 60)),
+        TimelineEntry("right_arm", "a person waves", frames=(20, 36)),
+    ]
+    goal = JointControl("pelvis", frames=[0, 59], positions=[[1, None, 2], [1, None, 4]])
+    hand = JointControl("right_wrist", frames=[30], positions=[[1, 1.3, 3]])
+    led = tiny_pipeline.timeline(entries, controls=[goal, hand], preset=SOLVED, samples=8, seed=1)
+    blind = tiny_pipeline.timeline(entries, preset=SOLVED, samples=8, seed=1)
+    for frame, joint, place in ((59, 0, [1.0, 0.0, 4.0]), (30, 21, [1.0, 1.3, 3.0])):
+        off = [
+            statistics.median(
+                (m.joints[frame, joint] - torch.tensor(place))[[0, 2]].norm().item() for m in motions
+            )
+            for motions in (led, blind)
+        ]
+        assert off[0] < 0.7 * off[1]
+
+
 def test_obstacles_are_avoided_by_what_tracks_make(tiny_pipeline):
-    free = tiny_pipeline.timeline(ENTRIES, preset=EDITED)
-    ball = Avoid(Sphere((free.best.joints[20, 15] + torch.tensor([0.1, 0.0, 0.0])).tolist(), 0.2))
-    result = tiny_pipeline.timeline(ENTRIES, obstacles=[ball], preset=EDITED)
-    assert result.penetration.item() < 0.5 * penetration(free.best.joints[None], [ball], HUMANML3D).item()
+    """A ball where the head is in a frame: there it leaves. The median over seeds, for the same reason."""
+    apart = []
+    for seed in range(5):
+        free = tiny_pipeline.timeline(ENTRIES, preset=EDITED, seed=seed).best
+        place = free.joints[20, 15] + torch.tensor([0.1, 0.0, 0.0])
+        ball = Avoid(Sphere(place.tolist(), 0.2))
+        result = tiny_pipeline.timeline(ENTRIES, obstacles=[ball], preset=EDITED, seed=seed)
+        apart.append((result.best.joints[20, 15] - place).norm().item())
+        assert result.penetration.item() == pytest.approx(
+            penetration(result.best.joints[None], [ball], HUMANML3D).item(), rel=1e-4
+        )
+    assert statistics.median(apart) > 0.2, apart
 
 
 def test_tracks_work_with_tlcontrol(tiny_tlcontrol):
