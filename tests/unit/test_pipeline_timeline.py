@@ -25,6 +25,14 @@ ENTRIES = [
     TimelineEntry("lower", "a person jumps", frames=(16, 40)),
     TimelineEntry("upper", "a person waves", frames=(0, 40)),
 ]
+WALK_AND_WAVE = [
+    TimelineEntry("lower", "a person walks", frames=(0, 60)),
+    TimelineEntry("right_arm", "a person waves", frames=(20, 36)),
+]
+GOALS = [
+    JointControl("pelvis", frames=[0, 59], positions=[[1, None, 2], [1, None, 4]]),
+    JointControl("right_wrist", frames=[30], positions=[[1, 1.3, 3]]),
+]
 
 
 @pytest.fixture
@@ -115,13 +123,7 @@ def test_controls_and_obstacles_count_in_every_pass(tiny_pipeline, passes):
 
 
 def test_tracks_are_made_apart_and_see_the_controls_of_their_joints(tiny_pipeline, passes):
-    entries = [
-        TimelineEntry("lower", "a person walks", frames=(0, 60)),
-        TimelineEntry("right_arm", "a person waves", frames=(20, 36)),
-    ]
-    goal = JointControl("pelvis", frames=[0, 59], positions=[[1, None, 2], [1, None, 4]])
-    hand = JointControl("right_wrist", frames=[30], positions=[[1, 1.3, 3]])
-    result = tiny_pipeline.timeline(entries, controls=[goal, hand], preset=SOLVED, samples=2, seed=1)
+    result = tiny_pipeline.timeline(WALK_AND_WAVE, controls=GOALS, preset=SOLVED, samples=2, seed=1)
     (call,) = passes
     assert call["lengths"] == [60, 60, 26, 26]  # the wave with a transition on either side
     assert torch.equal(call["text"][0], call["text"][1])
@@ -129,19 +131,13 @@ def test_tracks_are_made_apart_and_see_the_controls_of_their_joints(tiny_pipelin
     assert [sorted(set(clip.nonzero()[:, 1].tolist())) for clip in call["mask"]] == [[0], [0], [], []]
     torch.testing.assert_close(call["targets"][0, 59, 0], torch.tensor([0.0, 0.0, 2.0]))
     assert result.best.num_frames == 60
-    assert result.best.extra["timeline"] == tuple(entries)
+    assert result.best.extra["timeline"] == tuple(WALK_AND_WAVE)
 
 
 def test_tracks_come_nearer_to_the_targets_than_without_them(tiny_pipeline):
     """An untrained model has steps to hold that lead elsewhere, in some samples far: so the median."""
-    entries = [
-        TimelineEntry("lower", "a person walks", frames=(0, 60)),
-        TimelineEntry("right_arm", "a person waves", frames=(20, 36)),
-    ]
-    goal = JointControl("pelvis", frames=[0, 59], positions=[[1, None, 2], [1, None, 4]])
-    hand = JointControl("right_wrist", frames=[30], positions=[[1, 1.3, 3]])
-    led = tiny_pipeline.timeline(entries, controls=[goal, hand], preset=SOLVED, samples=8, seed=1)
-    blind = tiny_pipeline.timeline(entries, preset=SOLVED, samples=8, seed=1)
+    led = tiny_pipeline.timeline(WALK_AND_WAVE, controls=GOALS, preset=SOLVED, samples=8, seed=1)
+    blind = tiny_pipeline.timeline(WALK_AND_WAVE, preset=SOLVED, samples=8, seed=1)
     for frame, joint, place in ((59, 0, [1.0, 0.0, 4.0]), (30, 21, [1.0, 1.3, 3.0])):
         off = [
             statistics.median(
