@@ -20,6 +20,8 @@ from controlmm.pipelines import PRESETS
 STEP = 1e-5  # metres: float32 features whose steps add up along a clip
 SAME_CLIP = 1e-4  # latents of order one, after four steps; convolutions of another length round otherwise
 FEET = list(HUMANML3D.foot_joints)
+ROOT = len(FEET)  # its column of a term
+FOOT_WEIGHT, ROOT_WEIGHT = 15.0, 400.0  # for each m^2
 
 
 class Recording(MotionDecoder):
@@ -42,7 +44,7 @@ def turning(walk, tiny_pipeline) -> Recording:
 
 def term_of(decoder: Recording) -> FootStepTerm:
     frames = torch.ones(1, decoder.recorded.shape[1], dtype=torch.bool)
-    return FootStepTerm.of_motion(decoder, torch.zeros(1, 10, 16), frames, weight=1.0)
+    return FootStepTerm.of_motion(decoder, torch.zeros(1, 10, 16), frames)
 
 
 def test_velocities_and_positions_of_a_recording_agree(turning):
@@ -50,10 +52,10 @@ def test_velocities_and_positions_of_a_recording_agree(turning):
     turning.recorded[..., feature_layout(HUMANML3D).foot_contacts] = 0
     joints = recover_joints(turning.recorded, joints=22)
     term = term_of(turning)
-    steps = joints[:, :, FEET][..., [0, 2]].diff(dim=1)
+    steps = joints[:, :, [*FEET, 0]][..., [0, 2]].diff(dim=1)
     assert steps.abs().max() > 0.02
     torch.testing.assert_close(term.steps, steps, rtol=0, atol=STEP)
-    assert term.values(joints).item() < STEP**2 * steps.numel()
+    assert term.values(joints).item() < FOOT_WEIGHT * STEP**2 * steps.numel()
 
 
 def test_feet_at_rest_should_not_step_and_feet_in_the_air_may(turning):
@@ -65,20 +67,31 @@ def test_feet_at_rest_should_not_step_and_feet_in_the_air_may(turning):
     assert not term.steps[0, 10:12, 1].any()
     assert term.steps[0, 12, 1].any()
     expected = joints[0, 10:13, FEET[1]][:, [0, 2]].diff(dim=0).square().sum()
-    assert term.values(joints).item() == pytest.approx(expected.item(), abs=1e-8)
+    assert term.values(joints).item() == pytest.approx(FOOT_WEIGHT * expected.item(), abs=1e-7)
     height = joints[0, :, FEET, 1]
     high = torch.maximum(height[:-1], height[1:]) >= 0.12
     rests = torch.zeros_like(high)
     rests[10:12, 1] = True
-    assert torch.equal(term.counts[0], ~high | rests)
+    assert torch.equal(term.weights[0, :, :ROOT], FOOT_WEIGHT * (~high | rests))
+
+
+def test_a_root_that_lags_behind_costs(turning):
+    """Or else feet would be planted by a body that goes more slowly."""
+    joints = recover_joints(turning.recorded, joints=22)
+    term = term_of(turning)
+    slower = joints.clone()
+    slower[:, :, 0, [0, 2]] *= 0.9
+    missing = 0.1 * joints[0, :, 0][:, [0, 2]].diff(dim=0)
+    cost = term.values(slower) - term.values(joints)
+    assert cost.item() == pytest.approx(ROOT_WEIGHT * missing.square().sum().item(), rel=1e-3)
 
 
 def test_padding_counts_nothing(turning):
     frames = torch.ones(1, 40, dtype=torch.bool)
     frames[:, 20:] = False
     term = FootStepTerm.of_motion(turning, torch.zeros(1, 10, 16), frames)
-    assert term.counts[:, :19].any()
-    assert not term.counts[:, 19:].any()
+    assert term.weights[:, :19, :ROOT].any()
+    assert not term.weights[:, 19:].any()
 
 
 def test_latents_move_until_feet_do_as_the_decoder_says(tiny_pipeline):
