@@ -22,9 +22,9 @@ from controlmm.motion.layout import feature_layout
 from controlmm.motion.skeleton import Skeleton
 from controlmm.ops import recover_joints
 
-# On 288 validation clips 8 steps bring skating from 0.181 to 0.109 (recorded 0.103), FID from 4.87 to 4.91 and
-# the speed of those who walk from 0.93 of the recorded to 0.91. Without the root's way 3 steps brought 0.124,
-# 5.14 and 0.83. 10 steps would bring 0.102 and more jerk.
+# On 288 validation clips 8 steps bring skating from 0.181 to 0.109 (recorded 0.103), FID from 4.87 to 4.91
+# and the speed of those who walk from 0.93 of the recorded to 0.91. Without the root's way 3 steps brought
+# 0.124, 5.14 and 0.83. 10 steps would bring 0.102 and more jerk.
 _ITERATIONS = 8
 _WEIGHT = 15.0  # for each m^2 of squared steps of feet; L-BFGS stops by absolute changes
 _WAY = 400.0  # the same for the root
@@ -36,8 +36,8 @@ class FootStepTerm:
     """Squared differences of horizontal steps from wanted ones, a sum over a clip.
 
     Attributes:
-        steps: (B, T-1, F+1, 2) metres from a frame to the next: of the feet as the decoder's velocities say, zero
-            where a foot rests, and of the root as it goes.
+        steps: (B, T-1, F+1, 2) metres from a frame to the next: of the feet as the decoder's velocities say,
+            zero where a foot rests, and of the root as it goes.
         weights: (B, T-1, F+1) for each m^2; 0 where a foot is in the air and outside the clip.
         skeleton: Whose ``F`` foot joints.
     """
@@ -55,7 +55,7 @@ class FootStepTerm:
         *,
         strength: float = 1.0,
     ) -> FootStepTerm:
-        """The term for the velocities and contacts that ``latents`` decode to, and for the way of their root."""
+        """The term for the velocities, the contacts and the way of the root that ``latents`` decode to."""
         skeleton = decoder.normalizer.skeleton
         layout, feet = feature_layout(skeleton), list(skeleton.foot_joints)
         features = decoder.features(latents, frames)
