@@ -230,7 +230,7 @@ def test_no_gradient_is_kept(tiny_pipeline):
 @pytest.fixture
 def decoded(tiny_pipeline, monkeypatch):
     """One controlled call without editing: result, final logits, and the motions that signals came from."""
-    from controlmm.pipelines import controlmm as module
+    from controlmm.pipelines import token_drawing as module
 
     seen = {"current": []}
     decode, signal = module.decode_with_control, ControlBranch.signal

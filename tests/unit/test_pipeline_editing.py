@@ -17,6 +17,7 @@ from controlmm.motion.motion import Motion
 from controlmm.motion.skeleton import HUMANML3D, KIT
 from controlmm.pipelines import Preset
 from controlmm.pipelines.source_motion import SourceMotion, kept_frames
+from controlmm.pipelines.token_drawing import drawn_latents
 
 QUICK = Preset(EditingBudget(latent_iterations=3), steps=3)
 UNEDITED = Preset(EditingBudget(latent_iterations=0), steps=3)
@@ -79,7 +80,7 @@ def test_kept_tokens_survive_decoding_under_control(tiny_pipeline, logits_iterat
     request = request_of(tiny_pipeline, 10, kept=KeptTokens(ids, where))
     frames = torch.ones(1, 40, dtype=torch.bool)
     objective = ControlObjective(tiny_pipeline.decoder, targets, mask, frames)
-    latents = tiny_pipeline.drawn_latents(request, objective, tiny_pipeline.control, plan)
+    latents = drawn_latents(tiny_pipeline, request, objective, tiny_pipeline.control, plan)
     wanted = tiny_pipeline.decoder.tokenizer.quantizer.lookup(ids)
     torch.testing.assert_close(latents[where], wanted[where])
     assert (latents[~where] - wanted[~where]).abs().max() > 1e-3

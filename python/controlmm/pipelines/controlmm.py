@@ -14,17 +14,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from controlmm.controls import Avoid, Control, Objective, Obstacle
-from controlmm.generation.controlled_layers import ControlledLayers
 from controlmm.generation.decoding_request import DecodingRequest
 from controlmm.generation.frozen_layers import has_fast_bfloat16
 from controlmm.generation.latent_editing import edit_latents
-from controlmm.generation.masked_decoding import (
-    decode_from_text,
-    decode_with_control,
-    fill_residual_layers,
-    final_base_ids,
-    final_latents,
-)
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.noise import ClipNoise
 from controlmm.generation.objective import ControlObjective
@@ -48,6 +40,7 @@ from controlmm.pipelines.motion_editing import run_edit
 from controlmm.pipelines.output import GenerationResult
 from controlmm.pipelines.pipeline import MotionPipeline
 from controlmm.pipelines.presets import Preset, resolve_preset, with_limits
+from controlmm.pipelines.token_drawing import drawn_latents, latents_from_text
 from controlmm.text import TextEncoder
 
 _Network = TypeVar("_Network", bound=nn.Module)
@@ -285,7 +278,7 @@ class ControlMM(MotionPipeline[Preset]):
                 continue
             request = request_for(rows)
             if branch is None and not terms:
-                drawn = self._from_text(request, preset)
+                drawn = latents_from_text(self, request, preset)
                 strength = preset.budget.naturalness
                 latents[rows] = with_planted_feet(
                     self.decoder, drawn, request.valid, strength=strength, progress=progress
@@ -299,7 +292,7 @@ class ControlMM(MotionPipeline[Preset]):
                 norm=preset.control_norm,
                 terms=[term.select(rows) for term in terms],
             )
-            drawn = self.drawn_latents(request, objective, branch, preset)
+            drawn = drawn_latents(self, request, objective, branch, preset)
             keep = request.valid[..., None].float()
             latents[rows] = edit_latents(objective, drawn, keep, preset.budget, progress=progress).latents
         return latents
@@ -312,23 +305,6 @@ class ControlMM(MotionPipeline[Preset]):
     def packed(self, network: _Network, dtype: torch.dtype) -> _Network:
         """A quicker copy of one of the networks, see :mod:`controlmm.generation.packed_networks`."""
         return self._packed.of(network, dtype)
-
-    def _from_text(self, request: DecodingRequest, preset: Preset) -> Tensor:
-        base_ids = decode_from_text(self.packed(self.transformer, request.dtype), request)
-        return self.decoder.tokenizer.quantizer.lookup(self._filled(base_ids, request, preset))
-
-    def _filled(
-        self,
-        base_ids: Tensor,
-        request: DecodingRequest,
-        preset: Preset,
-        control: ControlledLayers | None = None,
-    ) -> Tensor:
-        """All layers of codes: those of tokens that are kept, the others from the residual transformer."""
-        scale = self.guidance.under(preset).residual
-        residual = self.packed(self.residual, request.dtype)
-        ids = fill_residual_layers(residual, base_ids, request, guidance_scale=scale, control=control)
-        return ids if request.kept is None else request.kept.put_back(ids)
 
     def refined_latents(
         self,
@@ -348,50 +324,6 @@ class ControlMM(MotionPipeline[Preset]):
         )
         keep = valid[..., None].float()
         return edit_latents(objective, latents, keep, preset.budget, progress=progress).latents
-
-    def drawn_latents(
-        self,
-        request: DecodingRequest,
-        objective: ControlObjective,
-        branch: ControlBranch | None,
-        preset: Preset,
-    ) -> Float[Tensor, "B L C"]:
-        """Latents before they are edited; a ``branch`` and logits editing take them towards targets."""
-        if branch is None and not preset.budget.logits_iterations:
-            return self._from_text(request, preset)
-        return self._from_logits(request, objective, branch, preset)
-
-    def _from_logits(
-        self,
-        request: DecodingRequest,
-        objective: ControlObjective,
-        branch: ControlBranch | None,
-        preset: Preset,
-    ) -> Tensor:
-        logits = decode_with_control(
-            self.packed(self.transformer, request.dtype),
-            None if branch is None else self.packed(branch, request.dtype),
-            self.decoder,
-            objective,
-            request,
-            budget=preset.budget,
-        )
-        base_ids = final_base_ids(logits, request)
-        control = None
-        if branch is not None and self.residual_control is not None:
-            base = final_latents(self.decoder.tokenizer, logits, base_ids[..., None], request)
-            network = self.packed(self.residual_control, request.dtype)
-            control = ControlledLayers(
-                network,
-                self.decoder,
-                objective.targets,
-                objective.mask,
-                base,
-                request.kept,
-                strength=self.guidance.control,
-            ).quick(objective.frames, request.dtype)
-        ids = self._filled(base_ids, request, preset, control)
-        return final_latents(self.decoder.tokenizer, logits, ids, request)
 
 
 def _padded(dense: Tensor, frames: int) -> Tensor:

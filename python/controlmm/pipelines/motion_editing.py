@@ -29,6 +29,7 @@ from controlmm.pipelines.output import GenerationResult
 from controlmm.pipelines.pipeline import MAX_FRAMES
 from controlmm.pipelines.presets import Preset
 from controlmm.pipelines.source_motion import Interval
+from controlmm.pipelines.token_drawing import drawn_latents
 
 if TYPE_CHECKING:
     from controlmm.pipelines.controlmm import ControlMM
@@ -132,7 +133,7 @@ def _drawn(
     shown = scene.shown
     objective = _objective(pipeline, shown.targets, shown.mask, terms, len(ids), preset)
     branch = None if shown.is_empty else pipeline.control
-    return pipeline.drawn_latents(request, objective, branch, preset)
+    return drawn_latents(pipeline, request, objective, branch, preset)
 
 
 def _final(
