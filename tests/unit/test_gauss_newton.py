@@ -258,13 +258,8 @@ def test_a_clips_solution_does_not_depend_on_batch_padding_or_threads(scene, thr
     try:
         for clip, length in enumerate([24, 16, 24]):
             rows = slice(clip, clip + 1)
-            # the joints decide which columns there are; a batch has those of all its clips
             alone = ControlResiduals(
-                decoder,
-                targets[rows, :length],
-                mask[rows, :length],
-                frames[rows, :length],
-                joints=controlled_joints(mask),
+                decoder, targets[rows, :length], mask[rows, :length], frames[rows, :length]
             )
             tokens = length // 4
             single = gauss_newton(alone, latents[rows, :tokens], keep[rows, :tokens], stopping)

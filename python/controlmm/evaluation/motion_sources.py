@@ -114,7 +114,7 @@ class Reconstruction:
         frames = frame_mask(batch.lengths, MAX_FRAMES)
         normalized = normalizer.normalize(batch.real) * frames[..., None]
         latents = tokenizer.quantizer.lookup(tokenizer.encode(normalized, frames))
-        features = self._decoder.features(latents, frames)
+        features = self._decoder.clip_features(latents, frames)
         return Produced(features, time.perf_counter() - started, has_padding=False)
 
 
@@ -137,7 +137,7 @@ class Generated:
         latents, numbers = self.latents(batch)
         tokens = MAX_FRAMES // pipeline.decoder.downsample
         latents = torch.nn.functional.pad(latents, (0, 0, 0, tokens - latents.shape[1]))
-        features = pipeline.decoder.features(latents, frames)
+        features = pipeline.decoder.clip_features(latents, frames)
         if pipeline.wants_exact(self.preset):
             self._meet_targets(features, batch)
         seconds = time.perf_counter() - started

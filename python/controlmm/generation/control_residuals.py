@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from controlmm.generation.clip_sums import one_thread
 from controlmm.generation.code_spread import CodeSpread
 from controlmm.generation.kinematic_rows import KinematicRows, kinematic_rows
 from controlmm.generation.motion_decoder import MotionDecoder
@@ -43,6 +44,7 @@ class Probe:
     strain: float
 
     @property
+    @one_thread()
     def loss(self) -> float:
         """Mean squared error, as of :class:`ControlObjective`."""
         return self.residual.square().mean().item() if len(self.residual) else 0.0

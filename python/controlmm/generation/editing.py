@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from controlmm.generation.frozen_layers import FrozenMatrix
 from controlmm.generation.objective import Objective
 from controlmm.generation.solvers.adamw import papers_optimizer
 from controlmm.generation.solvers.gradient import plain_gradient
@@ -102,12 +103,19 @@ def edit_logits(
     """
     edited = logits.detach().clone().requires_grad_()
     stepper = _OPTIMIZERS[optimizer](edited, rate)
+    of_weights, of_latents = (FrozenMatrix(matrix, None, codes.dtype) for matrix in (codes.T, codes))
+    is_done = torch.zeros(len(logits), 1, 1, dtype=torch.bool)
     for _ in range(iterations):
         with torch.enable_grad():
-            latents = (token_mixture(edited, noise(), as_printed=as_printed) @ codes) * keep
+            weights = token_mixture(edited, noise(), as_printed=as_printed)
+        latents = of_weights(weights.detach().flatten(0, 1)).unflatten(0, logits.shape[:2]) * keep
         loss, gradient = objective.value_and_gradient(latents)
-        if not loss.any():
+        is_done |= (loss == 0)[:, None, None]  # whatever others do
+        if is_done.all():
             break
-        (edited.grad,) = torch.autograd.grad(latents, edited, gradient)
+        slope = of_latents((gradient * keep).flatten(0, 1)).unflatten(0, logits.shape[:2])
+        (edited.grad,) = torch.autograd.grad(weights, edited, slope)
+        before = edited.detach().clone()
         stepper.step()
+        edited.detach().copy_(before.where(is_done, edited.detach()))
     return edited.detach()

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import smooth_l1_loss
 
+from controlmm.generation.clip_sums import clip_sums
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.resting_feet import in_contact, led_feet
 from controlmm.motion.skeleton import Skeleton
@@ -48,7 +49,7 @@ class ContactTerm:
         A foot that has a target at a frame follows that alone; ``mask`` has the controlled coordinates.
         """
         skeleton = decoder.normalizer.skeleton
-        features = decoder.features(latents, frames)
+        features = decoder.clip_features(latents, frames)
         rests = in_contact(features, skeleton)
         free = frames[..., None] & ~led_feet(mask.any(-1), skeleton)
         rests[:, :-1] &= free[:, :-1] & free[:, 1:]  # a step has two frames
@@ -60,7 +61,7 @@ class ContactTerm:
         feet = joints[:, :, list(self.joints)]
         steps = (feet[:, 1:] - feet[:, :-1])[..., [0, 2]].square().sum(-1)
         rests = self.rests[:, :-1]
-        return self.weight * 0.5 * (steps * rests).sum((1, 2)) / rests.sum((1, 2)).clamp(min=1)
+        return self.weight * 0.5 * clip_sums(steps * rests) / rests.sum((1, 2)).clamp(min=1)
 
     def select(self, clips: Int[Tensor, " N"]) -> ContactTerm:
         """See :class:`JointTerm`."""
@@ -88,7 +89,7 @@ class PublishedFootTerm:
         """See :class:`JointTerm`."""
         pairs = (self.skeleton.left_foot, self.skeleton.right_foot)
         losses = torch.stack([self._loss(joints[:, :, list(pair)]) for pair in pairs]).mean(0)
-        return self.weight * (losses * self.frames).sum(1) / self.frames.sum(1)
+        return self.weight * clip_sums(losses * self.frames) / self.frames.sum(1)
 
     def select(self, clips: Int[Tensor, " N"]) -> PublishedFootTerm:
         """See :class:`JointTerm`."""

@@ -54,7 +54,7 @@ def edit_latents(
         milliseconds=None if budget.time_budget is None else 1000 * budget.time_budget,
     )
     if budget.solver == "papers":
-        rate = budget.latent_rate * objective.decoder.tokenizer.base_codes.std().item()
+        rate = budget.latent_rate * objective.decoder.code_deviation()
         if budget.optimizer == "gradient":
             return gradient_descent(objective, latents, keep, stopping, rate=rate, progress=progress)
         decays = budget.decays_rate

@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from controlmm.generation.clip_groups import clips_by_length
+from controlmm.generation.clip_sums import one_thread
 from controlmm.generation.code_spread import CodeSpread
 from controlmm.generation.frozen_decoder import FrozenDecoder
 from controlmm.generation.sensitivity import WINDOW, Sensitivity, measure_sensitivity
@@ -56,11 +58,10 @@ class MotionDecoder(nn.Module):
         """
         frozen, spread = self.frozen(), self.spread()
         unknown = [channel for channel in channels if channel not in self._sensitivities]
-        if unknown:
-            measured = measure_sensitivity(
-                frozen, self.typical_latents(), unknown, downsample=self.downsample, spread=spread
+        for channel in unknown:  # one by one: it is the same then whatever is measured beside it
+            self._sensitivities[channel] = measure_sensitivity(
+                frozen, self.typical_latents(), [channel], downsample=self.downsample, spread=spread
             )
-            self._sensitivities.update(zip(unknown, measured.split(), strict=True))
         frames = tokens * self.downsample
         if channels not in self._grams or self._grams[channels].shape[1] < frames:
             self._grams.pop(channels, None)
@@ -77,10 +78,16 @@ class MotionDecoder(nn.Module):
         books = [quantizer.book(layer).codes for layer in range(self.tokenizer.config.num_quantizers)]
         version = tuple(x for codes in books for x in (codes.data_ptr(), codes._version))
         if self._spread is None or self._spread[0] != version:
-            self._spread = version, CodeSpread.of_codebooks(books)
+            with one_thread():
+                self._spread = version, CodeSpread.of_codebooks(books)
             self._sensitivities.clear()
             self._grams.clear()
         return self._spread[1]
+
+    @one_thread()
+    def code_deviation(self) -> float:
+        """Standard deviation of the base codes' entries: the unit of rates."""
+        return self.tokenizer.base_codes.std().item()
 
     def typical_latents(self) -> Float[Tensor, "S W C"]:
         """A few sequences of random codes, always the same."""
@@ -99,6 +106,23 @@ class MotionDecoder(nn.Module):
     ) -> Float[Tensor, "B T D"]:
         """De-normalised features."""
         return self.normalizer.denormalize(self.tokenizer.decode(latents, frames).float())
+
+    @torch.no_grad()
+    def clip_features(
+        self, latents: Float[Tensor, "B L C"], frames: Bool[Tensor, "B T"] | None = None
+    ) -> Float[Tensor, "B T D"]:
+        """De-normalised features, each clip decoded at its own length: the same, to the bit, in any batch.
+
+        On the CPU and without gradients; :meth:`features` has neither limit.
+        """
+        frozen, step = self.frozen(), self.downsample
+        if frames is None:
+            frames = torch.ones(len(latents), latents.shape[1] * step, dtype=torch.bool)
+        channels = range(len(self.normalizer.mean))
+        normalized = torch.zeros(*frames.shape, len(channels))
+        for length, rows in clips_by_length(frames[:, ::step].sum(1).tolist()):
+            normalized[rows, : length * step], _ = frozen.forward(latents[rows, :length], channels)
+        return self.normalizer.denormalize(normalized)
 
     def forward(
         self, latents: Float[Tensor, "B L C"], frames: Bool[Tensor, "B T"] | None = None

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import max_pool1d
 
+from controlmm.generation.clip_sums import clip_sums
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.resting_feet import in_contact, led_feet
 from controlmm.motion.skeleton import Skeleton
@@ -88,7 +89,7 @@ class Naturalness:
         The floor is kept level where no height has a target, unless the start climbs by half a metre.
         """
         skeleton = decoder.normalizer.skeleton
-        features = decoder.features(latents, frames)
+        features = decoder.clip_features(latents, frames)
         joints = recover_joints(features, joints=skeleton.num_joints)
         is_led = mask.any(-1)
         floors = floor_heights(joints, frames, skeleton)
@@ -136,18 +137,18 @@ class Naturalness:
         ):
             spans, inside = (x.unfold(1, order + 1, 1) for x in (is_free, self.frames))
             counts = spans.any(-1) & inside.all(-1)[..., None]  # where all frames are led, targets decide
-            total = total + (moved.diff(n=order, dim=1).square().sum(-1) * counts).sum((1, 2))
+            total = total + clip_sums(moved.diff(n=order, dim=1).square().sum(-1) * counts)
         return total
 
     def _sliding(self, joints: Float[Tensor, "B T J 3"]) -> Float[Tensor, "B"]:
         steps = joints[:, :, list(self.skeleton.foot_joints)].diff(dim=1).square().sum(-1)
-        return (steps * self.rests[:, :-1]).sum((1, 2))
+        return clip_sums(steps * self.rests[:, :-1])
 
     def _unevenness(self, joints: Float[Tensor, "B T J 3"]) -> Float[Tensor, "B"]:
         """Of motions that will be stood on the floor: heights count from the clip's lowest point."""
         floors = floor_heights(joints, self.frames, self.skeleton)
-        above = floors - floors.amin(1, keepdim=True)
-        return (above.square() * self.frames).sum(1) * self.is_level
+        lowest = floors.where(self.frames, torch.inf).amin(1, keepdim=True)
+        return clip_sums((floors - lowest).square() * self.frames) * self.is_level
 
 
 def floor_heights(

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from controlmm.generation.clip_sums import clip_sums
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.objective import ControlObjective
 from controlmm.generation.resting_feet import in_contact
@@ -58,7 +59,7 @@ class FootStepTerm:
         """The term for the velocities, the contacts and the way of the root that ``latents`` decode to."""
         skeleton = decoder.normalizer.skeleton
         layout, feet = feature_layout(skeleton), list(skeleton.foot_joints)
-        features = decoder.features(latents, frames)
+        features = decoder.clip_features(latents, frames)
         joints = skeleton.metres * recover_joints(features, joints=skeleton.num_joints)
         velocities = features[..., layout.joint_velocities].unflatten(-1, (-1, 3))[:, :, feet]
         steps = skeleton.metres * _in_world(velocities, features[..., layout.root_yaw_velocity])[:, :-1]
@@ -77,7 +78,7 @@ class FootStepTerm:
         moving = [*self.skeleton.foot_joints, 0]
         steps = self.skeleton.metres * joints[:, :, moving][..., [0, 2]].diff(dim=1)
         off = (steps - self.steps).square().sum(-1)
-        return (off * self.weights).sum((1, 2))
+        return clip_sums(off * self.weights)
 
     def select(self, clips: Int[Tensor, " N"]) -> FootStepTerm:
         """See :class:`JointTerm`."""

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from controlmm.generation.clip_sums import clip_sums
 from controlmm.motion.body_parts import body_parts
 from controlmm.motion.skeleton import Skeleton
 
@@ -96,5 +97,4 @@ def _seen_from_root(
 
 def _mean(values: Float[Tensor, "B *N"], counts: Bool[Tensor, "B *N"]) -> Float[Tensor, "B"]:
     """Mean over what counts; 0 where nothing does."""
-    total = (values * counts).flatten(1).sum(1)
-    return total / counts.flatten(1).sum(1).clamp(min=1)
+    return clip_sums(values * counts) / counts.flatten(1).sum(1).clamp(min=1)

@@ -16,9 +16,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from controlmm.generation.clip_sums import one_thread
 from controlmm.generation.code_spread import CodeSpread
 from controlmm.generation.frozen_decoder import FrozenDecoder
 
+_BITS = 20  # of a row's largest entry: products have 40, and float64 holds sums of 2^13 of them exactly
 WINDOW = 25  # tokens of a sequence; of a channel's answer, less than 2 % comes from farther away than 12
 
 
@@ -43,15 +45,10 @@ class Sensitivity:
             torch.cat([channel.scatter for channel in channels]),
         )
 
-    def split(self) -> list[Sensitivity]:
-        """Of each channel by itself."""
-        parts = zip(self.mean.split(1), self.scatter.split(1), strict=True)
-        return [Sensitivity(mean, scatter) for mean, scatter in parts]
-
     def gram(self, tokens: int) -> Float[Tensor, "D T D T"]:
         """``G`` for a clip of ``tokens`` tokens, float64."""
         channels, step, window = self.mean.shape[:3]
-        rows = self.mean.flatten(0, 1).double()  # (N, W, C) with N = D S
+        rows = _in_whole_numbers(self.mean.flatten(0, 1).double())  # (N, W, C) with N = D S
         lags = torch.zeros(2 * window, len(rows), len(rows), dtype=torch.float64)  # the last: out of sight
         for lag in range(window):  # token s sees at w what token s + lag sees at w - lag
             overlap = rows[:, lag:].flatten(1) @ rows[:, : window - lag].flatten(1).T
@@ -70,6 +67,14 @@ class Sensitivity:
         return gram
 
 
+def _in_whole_numbers(rows: Float[Tensor, "N W C"]) -> Float[Tensor, "N W C"]:
+    """Rows as multiples of a power of two: sums of their products are exact, and in any order the same."""
+    exponent = torch.frexp(rows.flatten(1).abs().amax(1)).exponent
+    unit = torch.ldexp(torch.ones_like(exponent, dtype=rows.dtype), exponent - _BITS)[:, None, None]
+    return (rows / unit).round() * unit
+
+
+@one_thread()
 def measure_sensitivity(
     decoder: FrozenDecoder,
     latents: Float[Tensor, "S W C"],

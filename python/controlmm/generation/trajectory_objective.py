@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import smooth_l1_loss
 
+from controlmm.generation.clip_sums import clip_sums
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.objective import ControlObjective, Objective
 from controlmm.generation.terms import JointTerm
@@ -114,7 +115,7 @@ class JointwiseObjective:
 
 def _smooth_l1(joints: Tensor, targets: Tensor, mask: Tensor) -> Tensor:
     losses = smooth_l1_loss(joints, targets, reduction="none") * mask
-    return losses.flatten(1).sum(1) / mask.flatten(1).sum(1).clamp(min=1)
+    return clip_sums(losses) / mask.flatten(1).sum(1).clamp(min=1)
 
 
 def _mean_distance(joints: Tensor, targets: Tensor, mask: Tensor) -> Tensor:

@@ -55,8 +55,8 @@ def adjusted(
     )
     stopping = Stopping(iterations=_ITERATIONS, error=tolerance)
     solution = gauss_newton(residuals, result.latents, keep, stopping)
-    features = decoder.features(solution.latents)[:, :frames]
-    features[:, :hold_frames] = decoder.features(result.latents)[:, :hold_frames]
+    features = decoder.clip_features(solution.latents)[:, :frames]
+    features[:, :hold_frames] = decoder.clip_features(result.latents)[:, :hold_frames]
     return scene.result(features, solution.latents, seconds_taken=time.perf_counter() - started)
 
 

@@ -64,7 +64,7 @@ def run_chain(
             preset=preset,
             progress=progress,
         )
-        features = pipeline.decoder.features(latents)[:, :frames]
+        features = pipeline.decoder.clip_features(latents)[:, :frames]
         if not tails:
             features = grounded(features)
         joints = recover_joints(features, joints=pipeline.skeleton.num_joints)

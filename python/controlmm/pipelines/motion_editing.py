@@ -91,7 +91,7 @@ def run_edit(
         may_change = request.valid if exact else request.drawn
         may_change = may_change[..., None].float()
         latents = edit_latents(objective, latents, may_change, preset.budget, progress=progress).latents
-    features = pipeline.decoder.features(latents)[:, :frames]
+    features = pipeline.decoder.clip_features(latents)[:, :frames]
     return edit_result(scene, features, latents, started)
 
 

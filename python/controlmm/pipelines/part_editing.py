@@ -45,7 +45,7 @@ def run_part_edit(
         )
     latents = _predicted(pipeline, scene, clip_seeds(seed, samples), preset)
     latents = _optimised(pipeline, scene, latents, preset, exact=exact, progress=progress)
-    features = pipeline.decoder.features(latents)[:, : scene.source.num_frames]
+    features = pipeline.decoder.clip_features(latents)[:, : scene.source.num_frames]
     return edit_result(scene, features, latents, started)
 
 

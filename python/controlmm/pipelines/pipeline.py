@@ -165,7 +165,7 @@ class MotionPipeline(PretrainedPipeline, ABC, Generic[_Plan]):
             terms=scene.terms(samples, padded=self.padded_frames(scene.frames), skeleton=self.skeleton),
             progress=progress,
         )
-        features = self.decoder.features(latents)[:, : scene.frames]
+        features = self.decoder.clip_features(latents)[:, : scene.frames]
         reports: list[ExactReport] = []
         if is_exact:
             for clip, edited in enumerate(features):

@@ -174,7 +174,7 @@ def _run_pass(
         terms=terms,
         progress=progress,
     )
-    features = pipeline.decoder.features(latents)[:, :length]
+    features = pipeline.decoder.clip_features(latents)[:, :length]
     if on_floor:
         features = grounded(features)
     joints = recover_joints(features, joints=skeleton.num_joints)

@@ -68,7 +68,7 @@ def run_tracks(
         terms=(term, *scene.terms(samples, padded=padded, skeleton=skeleton)),
         progress=progress,
     )
-    decoded = pipeline.decoder.features(latents)[:, :frames]
+    decoded = pipeline.decoder.clip_features(latents)[:, :frames]
     held = term.errors(recover_joints(decoded, joints=skeleton.num_joints))
     result = scene.result(decoded, latents, seconds_taken=time.perf_counter() - started)
     return dataclasses.replace(result, control_error=torch.maximum(result.control_error, held))
@@ -111,7 +111,7 @@ def _motions(
     for index, length in enumerate(lengths):
         tokens = pipeline.padded_frames(length) // pipeline.decoder.downsample
         clips = latents[index * samples : (index + 1) * samples, :tokens]
-        own = pipeline.decoder.features(clips)[:, :length]
+        own = pipeline.decoder.clip_features(clips)[:, :length]
         features.append(own if mask[index, ..., 1].any() else grounded(own))
     return features, [start for start, _ in spans]
 

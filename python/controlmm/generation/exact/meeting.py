@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from controlmm.generation.clip_sums import one_thread
 from controlmm.generation.exact.bones import restore_bones
 from controlmm.generation.exact.projection import project_on_targets
 from controlmm.generation.exact.refit import refit_features
@@ -40,6 +41,7 @@ class ExactReport:
     slide: tuple[float, float]
 
 
+@one_thread()
 def meet_exactly(
     features: Float[Tensor, "T D"],
     targets: Float[Tensor, "T J 3"],

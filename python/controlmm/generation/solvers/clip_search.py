@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from controlmm.generation.clip_sums import one_thread
 from controlmm.generation.code_spread import CodeSpread
 from controlmm.generation.objective import Measured, Objective
 from controlmm.generation.solvers.stopping import Reason, Solution, Stopping, Watch
@@ -57,6 +58,7 @@ class ClipRecord:
         if loss < self._best_loss:
             self._best, self._best_loss = point, loss
 
+    @one_thread()
     def placed(self, point: Tensor, latents: Float[Tensor, "L C"]) -> Float[Tensor, "L C"]:
         """``latents`` with the unknowns replaced by ``point``."""
         placed, rows = latents.clone(), point.unflatten(0, (-1, latents.shape[-1]))
@@ -65,6 +67,7 @@ class ClipRecord:
         )
         return placed
 
+    @one_thread()
     def gradient(self, gradient: Float[Tensor, "L C"]) -> Float[Tensor, "N"]:
         """The gradient in the unknowns, given that in the latents."""
         rows = gradient[self.is_free]
@@ -105,8 +108,8 @@ def run_searches(
             record.reason = watch.verdict(loss=loss, error=error, evaluations=len(record.losses))
             if record.reason is None:
                 try:
-                    sample = Sample(loss, record.gradient(gradient))
-                    points[row] = searches[row].send(sample)
+                    with one_thread():
+                        points[row] = searches[row].send(Sample(loss, record.gradient(gradient)))
                 except StopIteration as stop:
                     record.reason = stop.value
         report(progress, max(len(record.losses) for record in records), stopping)

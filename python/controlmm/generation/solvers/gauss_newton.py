@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from controlmm.generation.clip_sums import one_thread
 from controlmm.generation.control_residuals import ControlResiduals, Probe
 from controlmm.generation.solvers.clip_search import ClipRecord, Progress, report, solution_of
 from controlmm.generation.solvers.curvature import Curvature
@@ -103,6 +104,7 @@ class _Descent:
         """Whether the strain of the motion counts."""
         return self._natural is not None
 
+    @one_thread()
     def see(self, probe: Probe) -> Float[Tensor, "N"] | None:
         """Weights of the gradient wanted here; ``None`` if the point is refused for a nearer one."""
         if self._metric is None:
@@ -136,6 +138,7 @@ class _Descent:
         value, weights = self._metric.weigh(self._natural.shifted(probe.residual))
         return value + self._natural.value(probe, self.point), weights
 
+    @one_thread()
     def turn(self, gradient: Float[Tensor, "N"]) -> None:
         """Choose where to go from the latest point."""
         if self._natural is not None:
