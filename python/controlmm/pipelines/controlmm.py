@@ -23,6 +23,7 @@ from controlmm.generation.objective import ControlObjective
 from controlmm.generation.packed_networks import PackedCopies
 from controlmm.generation.planted_feet import with_planted_feet
 from controlmm.generation.solvers import Progress
+from controlmm.generation.stepping import with_steps
 from controlmm.generation.terms import JointTerm
 from controlmm.models.control_branch import ControlBranch
 from controlmm.models.length_estimator import LengthEstimator
@@ -293,6 +294,7 @@ class ControlMM(MotionPipeline[Preset]):
                 terms=[term.select(rows) for term in terms],
             )
             drawn = drawn_latents(self, request, objective, branch, preset)
+            drawn = with_steps(objective, drawn, request.valid, preset.budget, progress=progress)
             keep = request.valid[..., None].float()
             latents[rows] = edit_latents(objective, drawn, keep, preset.budget, progress=progress).latents
         return latents
