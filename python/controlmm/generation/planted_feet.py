@@ -23,9 +23,9 @@ from controlmm.motion.layout import feature_layout
 from controlmm.motion.skeleton import Skeleton
 from controlmm.ops import recover_joints
 
-# On 288 validation clips 3 steps bring skating from 0.113 to 0.092 (recorded 0.103) at the same FID (3.05, 3.04)
-# and 0.99 of the speed. Weights that slid in 0.181 of the frames needed the root's way: with it 8 steps brought
-# 0.109 and 0.98 of the speed, without it 3 brought 0.124, a higher FID and 0.90.
+# On 288 validation clips 3 steps bring skating from 0.113 to 0.092 (recorded 0.103) at the same FID, 3.05 and
+# 3.04, and 0.99 of the speed. Weights that slid in 0.181 of the frames needed the root's way: with it 8 steps
+# brought 0.109 and 0.98 of the speed, without it 3 brought 0.124, a higher FID and 0.90.
 _ITERATIONS = 3
 _WEIGHT = 15.0  # for each m^2 of squared steps of feet; L-BFGS stops by absolute changes
 _WAY = 400.0  # the same for the root
