@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
@@ -13,7 +14,7 @@ from controlmm.generation.latent_editing import edit_latents
 from controlmm.generation.objective import ControlObjective
 from controlmm.generation.solvers import Progress
 from controlmm.generation.step_plan import slides, step_targets
-from controlmm.motion.skeleton import Skeleton
+from controlmm.ops import recover_joints
 
 _ROUNDS = 2  # the second plans from what the first has reached
 _ITERATIONS, _TOLERANCE = 20, 0.02  # of a round, metres
@@ -48,9 +49,8 @@ def with_steps(
         or objective.terms
     ):
         return latents
-    rows = [
-        row for row in range(len(latents)) if slides(*_clip(objective, latents, row), _skeleton(objective))
-    ]
+    skeleton = objective.decoder.normalizer.skeleton
+    rows = [row for row, clip in enumerate(_clips(objective, latents)) if slides(*clip, skeleton)]
     if not rows:
         return latents
     chosen, stepped = objective.select(torch.tensor(rows)), latents[rows]
@@ -63,24 +63,21 @@ def with_steps(
     keep = valid[rows, :, None].to(latents.dtype)
     for _ in range(_ROUNDS):
         targets, mask = chosen.targets.clone(), chosen.mask.clone()
-        for row in range(len(rows)):
-            joints, wanted, led = _clip(chosen, stepped, row)
-            places = step_targets(joints, wanted, led, _skeleton(objective))
-            targets[row, : len(joints)], mask[row, : len(joints)] = places
+        for row, clip in enumerate(_clips(chosen, stepped)):
+            inside = slice(0, len(clip[0]))
+            targets[row, inside], mask[row, inside] = step_targets(*clip, skeleton)
         standing = ControlObjective(chosen.decoder, targets, mask, chosen.frames, norm=chosen.norm)
         stepped = edit_latents(standing, stepped, keep, rounds, progress=progress).latents
     return latents.index_copy(0, torch.tensor(rows), stepped)
 
 
-def _clip(
-    objective: ControlObjective, latents: Float[Tensor, "B L C"], row: int
-) -> tuple[Float[Tensor, "T J 3"], Float[Tensor, "T J 3"], Bool[Tensor, "T J 3"]]:
-    """Joints, targets and mask of one clip, decoded by itself: plans must not depend on the batch."""
-    decoder, frames = objective.decoder, int(objective.frames[row].sum())
-    alone = latents[row : row + 1, : frames // decoder.downsample]
-    joints = decoder(alone, objective.frames[row : row + 1, :frames])[0]
-    return joints, objective.targets[row, :frames], objective.mask[row, :frames]
-
-
-def _skeleton(objective: ControlObjective) -> Skeleton:
-    return objective.decoder.normalizer.skeleton
+def _clips(
+    objective: ControlObjective, latents: Float[Tensor, "B L C"]
+) -> Iterator[tuple[Float[Tensor, "T J 3"], Float[Tensor, "T J 3"], Bool[Tensor, "T J 3"]]]:
+    """Joints, targets and mask of each clip, on its own frames."""
+    decoder = objective.decoder
+    features = decoder.clip_features(latents, objective.frames)
+    joints = recover_joints(features, joints=decoder.normalizer.skeleton.num_joints)
+    ends = objective.frames.sum(1).tolist()
+    for end, clip in zip(ends, zip(joints, objective.targets, objective.mask, strict=True), strict=True):
+        yield clip[0][:end], clip[1][:end], clip[2][:end]
