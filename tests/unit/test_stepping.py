@@ -11,6 +11,7 @@ import torch
 from controlmm.controls import PathControl
 from controlmm.generation import stepping
 from controlmm.generation.objective import ControlObjective
+from controlmm.generation.planted_feet import FootStepTerm
 from controlmm.generation.step_plan import step_targets
 from controlmm.generation.stepping import with_steps
 from controlmm.motion.skeleton import HUMANML3D
@@ -70,6 +71,16 @@ def test_steps_do_not_depend_on_the_batch(scene, all_slide):
 def test_budgets_without_steps(scene, all_slide, change):
     objective, latents, valid = scene
     assert with_steps(objective, latents, valid, replace(BUDGET, **change)) is latents
+
+
+def test_obstacles_do_not_count_while_steps_are_made(scene, all_slide):
+    """They bend the way later; whoever goes around them steps all the same."""
+    objective, latents, valid = scene
+    term = FootStepTerm.of_motion(objective.decoder, latents, objective.frames)
+    parts = objective.decoder, objective.targets, objective.mask, objective.frames
+    others = ControlObjective(*parts, terms=[term])
+    stepped = with_steps(others, latents, valid, BUDGET)
+    assert torch.equal(stepped, with_steps(objective, latents, valid, BUDGET))
 
 
 def test_no_clip_that_slides_costs_no_editing(scene, monkeypatch):

@@ -33,21 +33,16 @@ def with_steps(
 
     Feet are given places to stand, see :mod:`controlmm.generation.step_plan`, for these rounds only: the
     editing that follows meets the targets alone. Nothing is done without naturalness, which is what steps are
-    for, with a time budget, which is for the targets, or with other terms, which may lead elsewhere.
+    for, or with a time budget, which is for the targets.
 
     Args:
-        objective: Targets of the clips.
+        objective: Targets of the clips; obstacles and other terms do not count here.
         latents: Where editing would start.
         valid: Tokens of each clip.
         budget: Of the editing that follows.
         progress: Called after every evaluation.
     """
-    if (
-        not budget.naturalness
-        or budget.time_budget is not None
-        or budget.solver == "papers"
-        or objective.terms
-    ):
+    if not budget.naturalness or budget.time_budget is not None or budget.solver == "papers":
         return latents
     skeleton = objective.decoder.normalizer.skeleton
     rows = [row for row, clip in enumerate(_clips(objective, latents)) if slides(*clip, skeleton)]
