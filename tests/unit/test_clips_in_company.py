@@ -149,5 +149,5 @@ def test_products_of_channels_do_not_depend_on_the_channels_beside_them():
     with one_thread():
         part = Sensitivity.joined([channels[1], channels[6]]).gram(5)
     assert torch.equal(part, whole[[1, 6], :20][:, :, [1, 6], :20])
-    rows = channels[6].mean[0, 2].double()
-    torch.testing.assert_close(whole[6, 2, 6, 2], rows.square().sum(), rtol=ROUNDING, atol=0)
+    row = channels[6].mean[0, 2]
+    torch.testing.assert_close(whole[6, 2, 6, 2], row.square().sum(), rtol=ROUNDING, atol=0)

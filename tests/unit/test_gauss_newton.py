@@ -8,6 +8,7 @@ import torch
 from controlmm.generation.code_spread import CodeSpread
 from controlmm.generation.control_residuals import ControlResiduals
 from controlmm.generation.frozen_decoder import FrozenDecoder
+from controlmm.generation.frozen_layers import neighbours
 from controlmm.generation.kinematic_rows import kinematic_rows
 from controlmm.generation.objective import ControlObjective
 from controlmm.generation.partial_decoder import PartialDecoder, controlled_joints
@@ -71,6 +72,24 @@ def test_tangents_and_gradients_are_adjoint():
     torch.testing.assert_close(forward, back, rtol=1e-4, atol=1e-4)
 
 
+def test_a_decoder_decodes_inside_inference_mode_and_outside():
+    """Its memory for neighbouring frames grows with the longest batch and outlives the mode it grew in."""
+    frozen = FrozenDecoder(make_decoder())
+    with torch.inference_mode():
+        inside, _ = frozen.forward(random(3, 2000, 8), CHANNELS)
+    outside, _ = frozen.forward(random(3, 2000, 8), CHANNELS)
+    assert torch.equal(inside, outside)
+
+
+@pytest.mark.parametrize(("frames", "distance"), [(7, 1), (7, 3), (3, 3), (2, 9)])
+def test_neighbours_of_frames(frames, distance):
+    x = random(2, frames, 5)
+    padded = torch.nn.functional.pad(x, (0, 0, distance, distance))
+    expected = torch.cat([padded[:, at : at + frames] for at in (0, distance, 2 * distance)], dim=2)
+    neighbours(random(3, 9, 5, seed=1), 2)  # leaves what must not be seen
+    assert torch.equal(neighbours(x, distance), expected)
+
+
 def test_a_packed_decoder_sees_new_weights(tiny_pipeline):
     decoder, latents = tiny_pipeline.decoder, random(1, 6, 16)
     before, _ = decoder.frozen().forward(latents, CHANNELS)
@@ -115,7 +134,7 @@ def test_partly_decoded_clips_do_not_depend_on_the_clips_beside_them(tiny_pipeli
 
 @pytest.fixture
 def rows_case():
-    """Features of 20 frames and 3 joints, a random mask, and the Jacobian by autograd."""
+    """Features of 20 frames and 3 joints, joints, mask, deviations; and the Jacobian by autograd."""
     features = (0.1 * random(20, 10)).double()
     features[:, 0] *= 0.5
     std = random(10, seed=1).double().abs() + 0.5
@@ -125,25 +144,25 @@ def rows_case():
     jacobian = torch.stack(
         [torch.autograd.grad(value, leaf, retain_graph=True)[0].T.flatten() for value in joints[mask]]
     )
-    rows = kinematic_rows((features * std), joints.detach(), mask, std)
-    return rows, mask, jacobian
+    return (features * std, joints.detach(), mask, std), jacobian
 
 
 def test_kinematic_rows_are_the_jacobian_of_the_kinematics(rows_case):
-    rows, _, jacobian = rows_case
+    case, jacobian = rows_case
+    rows = kinematic_rows(*case)
     dense = torch.cat([rows.root.flatten(1), rows.local.to_dense()], dim=1)
     torch.testing.assert_close(dense, jacobian, rtol=1e-12, atol=1e-12)
 
 
 def test_products_of_kinematic_rows_and_of_their_sums(rows_case):
-    rows, mask, jacobian = rows_case
+    case, jacobian = rows_case
     half = random(200, 200, seed=5).double()
     channels = (half @ half.T).reshape(10, 20, 10, 20)
     expected = jacobian @ half @ half.T @ jacobian.T
-    torch.testing.assert_close(rows.gram(channels), expected, rtol=1e-10, atol=1e-8)
-    groups = Groups.of_neighbours(mask, 3)
+    torch.testing.assert_close(kinematic_rows(*case).gram(channels), expected, rtol=1e-10, atol=1e-8)
+    groups = Groups.of_neighbours(case[2], 3)
     sums = torch.stack([groups.sum(unit) for unit in torch.eye(len(expected)).double()], dim=1)
-    summed = rows.summed(groups.index, groups.weight).gram(channels)
+    summed = kinematic_rows(*case, groups).gram(channels)
     torch.testing.assert_close(summed, sums @ expected @ sums.T, rtol=1e-10, atol=1e-8)
     torch.testing.assert_close(
         groups.spread(torch.arange(len(sums)).double()), sums.T @ torch.arange(len(sums)).double()
@@ -164,10 +183,11 @@ def test_groups_are_orthonormal_and_join_neighbours_of_one_coordinate():
 
 def test_a_metric_of_groups_is_a_metric(rows_case):
     """Symmetric and positive, so that the steps it gives go downhill."""
-    rows, mask, _ = rows_case
+    case, _ = rows_case
     half = random(200, 200, seed=5).double()
-    metric = Metric(rows, (half @ half.T).reshape(10, 20, 10, 20), mask, most_unknowns=20)
-    size = int(mask.sum())
+    groups = Groups.of_many(case[2], 20)
+    metric = Metric(kinematic_rows(*case, groups), (half @ half.T).reshape(10, 20, 10, 20), groups)
+    size = int(case[2].sum())
     matrix = torch.stack([metric.weigh(unit)[1] for unit in torch.eye(size).double()])
     assert size > 40
     torch.testing.assert_close(matrix, matrix.T, rtol=1e-8, atol=1e-12)
@@ -187,7 +207,7 @@ def test_the_step_is_the_least_norm_solution():
     rows = kinematic_rows(scaled, recover_joints(scaled[None], joints=3)[0], mask, std)
     whole = torch.cat([rows.root.flatten(1), rows.local.to_dense()], dim=1) @ jacobian
     residual = random(int(mask.sum()), seed=6).double()
-    metric = Metric(rows, (jacobian @ jacobian.T).reshape(10, 20, 10, 20), mask, damping=1e-12)
+    metric = Metric(rows, (jacobian @ jacobian.T).reshape(10, 20, 10, 20), damping=1e-12)
     value, weights = metric.weigh(residual)
     expected = torch.linalg.pinv(whole) @ residual
     torch.testing.assert_close(whole.T @ weights, expected, rtol=1e-5, atol=1e-7)
@@ -206,7 +226,7 @@ def test_sensitivity_of_a_linear_decoder_is_its_jacobians_product():
     count = len(channels) * 4 * tokens
     seeds = torch.eye(count).reshape(count, len(channels), 4 * tokens).mT
     jacobian = decoder.pull(tape.select(torch.zeros(count, dtype=torch.long)), seeds).flatten(1)
-    expected = (jacobian @ jacobian.T).reshape(3, 52, 3, 52).double()
+    expected = (jacobian @ jacobian.T).reshape(3, 52, 3, 52)
     middle = slice(20, 32)  # a channel sees 5 tokens to each side
     torch.testing.assert_close(
         measured.gram(tokens)[:, middle, :, middle], expected[:, middle, :, middle], rtol=1e-3, atol=1e-3

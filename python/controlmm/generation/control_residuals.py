@@ -11,6 +11,7 @@ from torch import Tensor
 
 from controlmm.generation.clip_sums import one_thread
 from controlmm.generation.code_spread import CodeSpread
+from controlmm.generation.coordinate_groups import Groups
 from controlmm.generation.kinematic_rows import KinematicRows, kinematic_rows
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.naturalness import Naturalness
@@ -49,9 +50,9 @@ class Probe:
         """Mean squared error, as of :class:`ControlObjective`."""
         return self.residual.square().mean().item() if len(self.residual) else 0.0
 
-    def rows(self) -> KinematicRows:
-        """How the residual answers to the channels, here."""
-        return kinematic_rows(self.features, self.joints, self.mask, self.std)
+    def rows(self, groups: Groups | None) -> KinematicRows:
+        """How the residual, or sums of its coordinates, answer to the channels, here."""
+        return kinematic_rows(self.features, self.joints, self.mask, self.std, groups)
 
 
 class ControlResiduals:

@@ -8,7 +8,9 @@ and with any number of threads.
 
 from __future__ import annotations
 
+import math
 import os
+import threading
 from typing import Literal
 
 import torch
@@ -130,11 +132,34 @@ class FrozenConv:
 
 
 def neighbours(x: Float[Tensor, "B T C"], distance: int) -> Float[Tensor, "B T 3C"]:
-    """Every frame between those ``distance`` before and after it, zeros beyond the ends."""
+    """Every frame between those ``distance`` before and after it, zeros beyond the ends.
+
+    The thread's next call writes over the result.
+    """
     batch, frames, channels = x.shape
-    rows = x.new_zeros(batch, frames, 3 * channels)
+    rows = _SCRATCH.empty((batch, frames, 3 * channels), x.dtype)
+    reach = min(distance, frames)
+    rows[:, :reach, :channels] = 0
+    rows[:, reach:, :channels] = x[:, : frames - reach]
     rows[..., channels : 2 * channels] = x
-    if frames > distance:
-        rows[:, distance:, :channels] = x[:, :-distance]
-        rows[:, :-distance, 2 * channels :] = x[:, distance:]
+    rows[:, : frames - reach, 2 * channels :] = x[:, reach:]
+    rows[:, frames - reach :, 2 * channels :] = 0
     return rows
+
+
+class _Scratch(threading.local):
+    """Memory that stays: of eight clips, fresh pages cost more than what is written into them."""
+
+    def __init__(self) -> None:
+        self._memory: dict[torch.dtype, Tensor] = {}
+
+    def empty(self, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+        """Not initialised, and shared with all that were asked for before."""
+        size = math.prod(shape)
+        if dtype not in self._memory or self._memory[dtype].numel() < size:
+            with torch.inference_mode(False):  # else it could not be written outside that mode
+                self._memory[dtype] = torch.empty(size, dtype=dtype)
+        return self._memory[dtype][:size].view(shape)
+
+
+_SCRATCH = _Scratch()

@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from controlmm.generation.coordinate_groups import Groups
+
 
 @dataclass(frozen=True, eq=False)
 class KinematicRows:
@@ -24,26 +26,12 @@ class KinematicRows:
     root: Float[Tensor, "N 3 T"]
     local: Tensor
 
-    def summed(self, group: Int[Tensor, "N"], weight: Float[Tensor, "N"]) -> KinematicRows:
-        """Rows of weighted sums, of which every coordinate enters one: number ``group``."""
-        count = int(group.max()) + 1
-        root = torch.zeros(count, *self.root.shape[1:], dtype=self.root.dtype)
-        root.index_add_(0, group, self.root * weight[:, None, None])
-        (row, column), value = self.local.indices(), self.local.values()
-        local = torch.sparse_coo_tensor(
-            torch.stack([group[row], column]),
-            value * weight[row],
-            (count, self.local.shape[1]),
-            check_invariants=False,
-        )
-        return KinematicRows(root, local.coalesce())
-
     def gram(self, channels: Float[Tensor, "D T D T"]) -> Float[Tensor, "N N"]:
         """``K G K^T`` for the channels' own ``G``."""
         frames = channels.shape[1]
         whole = channels.reshape(channels.shape[0] * frames, -1)
         split = 3 * frames
-        root, local = self.root.flatten(1), self.local
+        root, local = self.root.flatten(1).to(channels.dtype), self.local.to(channels.dtype)
         cross = torch.sparse.mm(local, (root @ whole[:split, split:]).T)  # (N, N): local x root
         own = torch.sparse.mm(local, torch.sparse.mm(local, whole[split:, split:]).T)
         gram: Tensor = root @ whole[:split, :split] @ root.T + cross + cross.T + own
@@ -55,6 +43,7 @@ def kinematic_rows(
     joints: Float[Tensor, "T J 3"],
     mask: Bool[Tensor, "T J 3"],
     std: Float[Tensor, "D"],
+    groups: Groups | None = None,
 ) -> KinematicRows:
     """Rows for the coordinates that ``mask`` marks, in the order of ``mask.nonzero()``; float64.
 
@@ -63,40 +52,61 @@ def kinematic_rows(
         joints: What they decode to.
         mask: The controlled coordinates.
         std: Of the channels, which are normalised.
+        groups: Sums of coordinates; then rows are theirs.
     """
     features, joints, std = features.double(), joints.double(), std.double()
-    frames = len(features)
     frame, joint, axis = mask.nonzero().T
+    if groups is None:
+        groups = Groups(torch.arange(len(frame)), torch.ones(len(frame), dtype=torch.float64))
     yaw = torch.cat([features.new_zeros(1), 2 * features[:-1, 0].cumsum(0)])
     cos, sin = yaw.cos(), yaw.sin()
     return KinematicRows(
-        _root_rows(joints, frame, joint, axis, cos, sin) * std[:3, None],
-        _local_rows(frame, joint, axis, cos, sin, std, frames),
+        _root_rows(joints, frame, joint, axis, cos, sin, groups) * std[:3, None],
+        _local_rows(frame, joint, axis, cos, sin, std, groups),
     )
 
 
 def _root_rows(
-    joints: Tensor, frame: Int[Tensor, "N"], joint: Tensor, axis: Tensor, cos: Tensor, sin: Tensor
+    joints: Tensor,
+    frame: Int[Tensor, "N"],
+    joint: Tensor,
+    axis: Tensor,
+    cos: Tensor,
+    sin: Tensor,
+    groups: Groups,
 ) -> Float[Tensor, "N 3 T"]:
-    """A turn of frame i swings all that comes later about the root of frame i; a step of it shifts it."""
-    frames = len(joints)
-    point, root = joints[frame, joint], joints[:, 0]
-    is_earlier = torch.arange(frames) < frame[:, None]  # (N, T)
-    swing_x = -2 * (point[:, 2, None] - root[:, 2])
-    swing_z = 2 * (point[:, 0, None] - root[:, 0])
+    """A turn of frame i swings all that comes later about the root of frame i; a step of it shifts it.
+
+    So a row at frame i needs no more of a group than two sums over its frames behind i.
+    """
+    count, frames, root = len(groups), len(joints), joints[:, 0]
+    lever = joints[frame, joint, torch.where(axis == 0, 2, 0)]
+    here = torch.zeros(2, count, frames, dtype=joints.dtype)
+    here[0, groups.index, frame] = groups.weight
+    here[1, groups.index, frame] = groups.weight * lever
+    after = torch.zeros_like(here)
+    after[..., :-1] = here.flip(-1).cumsum(-1).flip(-1)[..., 1:]
+    weights, levers = after
+    own = torch.zeros(count, 1, dtype=axis.dtype)
+    own[groups.index, 0] = axis
     next_cos, next_sin = cos.roll(-1), sin.roll(-1)  # a velocity is turned by the next frame's heading
-    along_x = torch.stack([swing_x, next_cos.expand_as(swing_x), -next_sin.expand_as(swing_x)], dim=1)
-    along_z = torch.stack([swing_z, next_sin.expand_as(swing_z), next_cos.expand_as(swing_z)], dim=1)
-    along = torch.where((axis == 0)[:, None, None], along_x, along_z)
-    rows: Tensor = along * (is_earlier & (axis != 1)[:, None])[:, None]
-    return rows
+    along_x = [-2 * (levers - weights * root[:, 2]), weights * next_cos, -weights * next_sin]
+    along_z = [2 * (levers - weights * root[:, 0]), weights * next_sin, weights * next_cos]
+    rows = [torch.where(own == 0, x, z) for x, z in zip(along_x, along_z, strict=True)]
+    return torch.stack(rows, dim=1) * (own != 1)[:, None]
 
 
 def _local_rows(
-    frame: Tensor, joint: Tensor, axis: Tensor, cos: Tensor, sin: Tensor, std: Tensor, frames: int
+    frame: Tensor,
+    joint: Tensor,
+    axis: Tensor,
+    cos: Tensor,
+    sin: Tensor,
+    std: Tensor,
+    groups: Groups,
 ) -> Tensor:
     """Sparse: the height of the root is channel 3, coordinate a of joint j is channel 1 + 3 j + a."""
-    rows = torch.arange(len(frame))
+    frames, rows, weight = len(cos), groups.index, groups.weight
     is_root, is_height = joint == 0, axis == 1
     height = torch.where(is_root, 3, 2 + 3 * joint)
     turns = ~is_height & ~is_root
@@ -109,8 +119,8 @@ def _local_rows(
     index = [
         torch.stack([rows[used], (channel[used] - 3) * frames + frame[used]]) for used, channel, _ in entries
     ]
-    values = [value[used] * std[channel[used]] for used, channel, value in entries]
-    size = (len(frame), (len(std) - 3) * frames)
+    values = [(value * weight)[used] * std[channel[used]] for used, channel, value in entries]
+    size = (len(groups), (len(std) - 3) * frames)
     return torch.sparse_coo_tensor(
         torch.cat(index, 1), torch.cat(values), size, check_invariants=False
     ).coalesce()

@@ -17,7 +17,7 @@ from controlmm.nn.quantizer import ResidualQuantizer
 from controlmm.ops import recover_joints
 
 _SEQUENCES, _SEED = 6, 1  # of random codes
-_REMEMBERED = 4  # matrices of channel products; each may take 100 MB
+_REMEMBERED = 4  # matrices of channel products; each may take 50 MB
 
 
 class MotionDecoder(nn.Module):

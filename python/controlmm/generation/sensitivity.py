@@ -46,7 +46,7 @@ class Sensitivity:
         )
 
     def gram(self, tokens: int) -> Float[Tensor, "D T D T"]:
-        """``G`` for a clip of ``tokens`` tokens, float64."""
+        """``G`` for a clip of ``tokens`` tokens."""
         channels, step, window = self.mean.shape[:3]
         rows = _in_whole_numbers(self.mean.flatten(0, 1).double())  # (N, W, C) with N = D S
         lags = torch.zeros(2 * window, len(rows), len(rows), dtype=torch.float64)  # the last: out of sight
@@ -56,13 +56,13 @@ class Sensitivity:
         token = torch.arange(tokens)
         distance = token[None, :] - token[:, None]  # (L, L)
         which = (distance + window - 1).where(distance.abs() < window, 2 * window - 1)
-        blocks = lags.reshape(-1, channels, step, channels, step).permute(1, 2, 3, 0, 4).contiguous()
-        split = torch.empty(channels, tokens, step, channels, tokens, step, dtype=torch.float64)
-        for row in range(tokens):  # this matrix may take 100 MB: it is written once
+        blocks = lags.reshape(-1, channels, step, channels, step).permute(1, 2, 3, 0, 4).float().contiguous()
+        split = torch.empty(channels, tokens, step, channels, tokens, step)
+        for row in range(tokens):  # this matrix may take 50 MB: it is written once
             split[:, row] = blocks[:, :, :, which[row]]
         frames = tokens * step
         gram = split.view(channels, frames, channels, frames)
-        own = self.scatter.double().repeat(1, tokens).flatten()
+        own = self.scatter.repeat(1, tokens).flatten()
         gram.view(channels * frames, channels * frames).diagonal().add_(own)
         return gram
 

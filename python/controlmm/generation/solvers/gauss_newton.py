@@ -18,6 +18,7 @@ from torch import Tensor
 
 from controlmm.generation.clip_sums import one_thread
 from controlmm.generation.control_residuals import ControlResiduals, Probe
+from controlmm.generation.coordinate_groups import Groups
 from controlmm.generation.solvers.clip_search import ClipRecord, Progress, report, solution_of
 from controlmm.generation.solvers.curvature import Curvature
 from controlmm.generation.solvers.metric import Metric
@@ -174,7 +175,8 @@ class _Descent:
     def _renew(self, probe: Probe) -> None:
         """The metric of the clip as it now is; gradients of the old one cannot be compared with new ones."""
         self._way = _way(probe)
-        self._metric = Metric(probe.rows(), self._residuals.channel_gram(probe), probe.mask)
+        groups = Groups.of_many(probe.mask)
+        self._metric = Metric(probe.rows(groups), self._residuals.channel_gram(probe), groups)
         self._memory.clear()
         self._gradient = None
 
