@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 from jaxtyping import Float
 from torch import Tensor
@@ -11,6 +12,7 @@ from controlmm.generation.editing import EditingBudget
 from controlmm.generation.naturalness import NaturalWeights
 from controlmm.generation.objective import ControlObjective
 from controlmm.generation.solvers import (
+    LbfgsTolerance,
     Progress,
     Solution,
     Stopping,
@@ -81,10 +83,11 @@ def _lbfgs(
     progress: Progress | None,
 ) -> Solution:
     """The first part of the way is natural; what is then left of the error goes the shortest way."""
+    search = partial(lbfgs, keep=keep, tolerance=_square_millimetres(plain), progress=progress)
     if natural is plain or stopping.iterations is None:
-        return lbfgs(natural, latents, keep, stopping, progress=progress)
+        return search(natural, latents, stopping=stopping)
     steps = round(_NATURAL_SHARE * stopping.iterations)
-    first = lbfgs(natural, latents, keep, replace(stopping, iterations=steps), progress=progress)
+    first = search(natural, latents, stopping=replace(stopping, iterations=steps))
     spent = 1000 * first.seconds
     if stopping.milliseconds is not None and spent >= stopping.milliseconds:
         return first
@@ -93,4 +96,11 @@ def _lbfgs(
         iterations=stopping.iterations - steps,
         milliseconds=None if stopping.milliseconds is None else stopping.milliseconds - spent,
     )
-    return first.then(lbfgs(plain, first.latents, keep, left, progress=progress))
+    return first.then(search(plain, first.latents, stopping=left))
+
+
+def _square_millimetres(objective: ControlObjective) -> LbfgsTolerance:
+    """PyTorch's tolerances, which are for losses of order one: in m^2 a millimetre is a millionth."""
+    usual, unit = LbfgsTolerance(), _PER_METRE[objective.decoder.normalizer.skeleton.unit]
+    factor = (unit / _PER_METRE["mm"]) ** 2
+    return LbfgsTolerance(gradient=factor * usual.gradient, change=factor * usual.change)
