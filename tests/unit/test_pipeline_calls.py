@@ -263,3 +263,18 @@ def test_editing_starts_from_a_soft_base_layer_and_hard_residual_layers(tiny_pip
     first, second = (tokenizer.quantizer.book(layer).codes for layer in (1, 2))
     sums = (first[:, None] + second).flatten(0, 1)
     assert torch.cdist(left[0], sums).amin(1).max() < 1e-2  # cdist takes roots of rounded squares
+
+
+def test_a_call_takes_one_thread_and_gives_the_others_back(tiny_pipeline):
+    """On a machine whose cores are busy, small operators of several threads wait for each other."""
+    before, seen = torch.get_num_threads(), set()
+    try:
+        torch.set_num_threads(2)
+        tiny_pipeline("walks", frames=24, progress=lambda *_: seen.add(torch.get_num_threads()))
+        assert seen == {1}
+        assert torch.get_num_threads() == 2
+        with pytest.raises(ValueError, match="`samples`"):
+            tiny_pipeline("walks", frames=24, samples=0)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)

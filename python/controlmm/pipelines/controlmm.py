@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from controlmm.controls import Avoid, Control, Objective, Obstacle
+from controlmm.generation.clip_sums import one_thread
 from controlmm.generation.decoding_request import DecodingRequest
 from controlmm.generation.frozen_layers import has_fast_bfloat16
 from controlmm.generation.latent_editing import edit_latents
@@ -113,6 +114,7 @@ class ControlMM(MotionPipeline[Preset]):
         return replace(plan, guidance_scale=scales.base, residual_guidance_scale=scales.residual)
 
     @torch.no_grad()
+    @one_thread()
     def edit(
         self,
         motion: Motion,
@@ -184,6 +186,7 @@ class ControlMM(MotionPipeline[Preset]):
         )
 
     @torch.no_grad()
+    @one_thread()
     def adjust(
         self,
         result: GenerationResult,
@@ -233,6 +236,7 @@ class ControlMM(MotionPipeline[Preset]):
         return tokens * self.decoder.downsample
 
     @torch.no_grad()
+    @one_thread()
     def generate_latents(
         self,
         text: Float[Tensor, "B E"],

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from controlmm.controls import Avoid, Control, Objective, Obstacle
+from controlmm.generation.clip_sums import one_thread
 from controlmm.generation.code_optimization import optimize_codes
 from controlmm.generation.code_prediction import CodePrediction
 from controlmm.generation.motion_decoder import MotionDecoder
@@ -105,6 +106,7 @@ class TLControl(MotionPipeline[TLControlPreset]):
         return super().__call__(prompt, preset=plan, **call)
 
     @torch.no_grad()
+    @one_thread()
     def edit(
         self,
         motion: Motion,
@@ -154,6 +156,7 @@ class TLControl(MotionPipeline[TLControlPreset]):
         return resolve_tlcontrol_preset(preset, guidance_scale=guidance_scale)
 
     @torch.no_grad()
+    @one_thread()
     def generate_latents(
         self,
         text: Float[Tensor, "B E"],
