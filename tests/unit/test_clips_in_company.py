@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from controlmm import ControlMM, JointControl
-from controlmm.generation.clip_sums import clip_sums, one_thread
+from controlmm.generation.clip_sums import clip_sums
 from controlmm.generation.editing import EditingBudget
 from controlmm.generation.motion_decoder import MotionDecoder
+from controlmm.generation.one_thread import one_thread
 from controlmm.generation.sensitivity import Sensitivity
 from controlmm.models.rvq_vae import frame_mask
 from controlmm.ops import recover_joints

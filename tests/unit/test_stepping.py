@@ -89,6 +89,15 @@ def test_no_clip_that_slides_costs_no_editing(scene, monkeypatch):
     assert with_steps(objective, latents, valid, BUDGET) is latents
 
 
+def test_rounds_are_one_phase_that_only_goes_on(scene, all_slide):
+    seen = []
+    with_steps(*scene, BUDGET, progress=lambda *step: seen.append(step))
+    assert {(phase, total) for phase, _, total in seen} == {("planned steps", 40)}
+    done = [done for _, done, _ in seen]
+    assert done == sorted(done)
+    assert done[0] <= 20 < done[-1] <= 40
+
+
 def test_a_pipeline_steps_before_it_edits(tiny_pipeline, all_slide):
     """Fails where the pipeline leaves steps out: the same call without them ends elsewhere."""
     walk = PathControl("pelvis", xz=np.array([[0.0, 0.0], [0.0, 1.5]]))

@@ -9,12 +9,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from controlmm.generation.clip_sums import one_thread
 from controlmm.generation.code_spread import CodeSpread
 from controlmm.generation.coordinate_groups import Groups
 from controlmm.generation.kinematic_rows import KinematicRows, kinematic_rows
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.naturalness import Naturalness
+from controlmm.generation.one_thread import one_thread
 from controlmm.generation.partial_decoder import PartialDecoder, controlled_joints
 from controlmm.ops import recover_joints
 

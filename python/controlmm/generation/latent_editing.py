@@ -24,7 +24,7 @@ from controlmm.generation.solvers import (
 
 _LBFGS_STEPS = 4  # for each step of Gauss-Newton, which costs as much and looks further ahead
 _NATURAL_SHARE = 0.4  # of the steps of L-BFGS
-_PER_METRE = {"m": 1.0, "mm": 1000.0}  # of a skeleton's unit
+_MILLIMETRE = 1e-3  # metres
 
 
 def edit_latents(
@@ -49,7 +49,7 @@ def edit_latents(
     plain = objective
     if budget.naturalness:
         objective = objective.kept_natural(latents, NaturalWeights().times(budget.naturalness))
-    unit = _PER_METRE[objective.decoder.normalizer.skeleton.unit]
+    unit = 1 / objective.decoder.normalizer.skeleton.metres
     stopping = Stopping(
         error=None if budget.tolerance is None else budget.tolerance * unit,
         iterations=budget.latent_iterations,
@@ -101,6 +101,6 @@ def _lbfgs(
 
 def _square_millimetres(objective: ControlObjective) -> LbfgsTolerance:
     """PyTorch's tolerances, which are for losses of order one: in m^2 a millimetre is a millionth."""
-    usual, unit = LbfgsTolerance(), _PER_METRE[objective.decoder.normalizer.skeleton.unit]
-    factor = (unit / _PER_METRE["mm"]) ** 2
+    usual = LbfgsTolerance()
+    factor = (_MILLIMETRE / objective.decoder.normalizer.skeleton.metres) ** 2
     return LbfgsTolerance(gradient=factor * usual.gradient, change=factor * usual.change)

@@ -7,9 +7,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from controlmm.generation.clip_groups import clips_by_length
-from controlmm.generation.clip_sums import one_thread
 from controlmm.generation.code_spread import CodeSpread
 from controlmm.generation.frozen_decoder import FrozenDecoder
+from controlmm.generation.one_thread import one_thread
 from controlmm.generation.sensitivity import WINDOW, Sensitivity, measure_sensitivity
 from controlmm.models.tokenizer import MotionTokenizer
 from controlmm.motion.normalizer import Normalizer

@@ -12,8 +12,6 @@ from controlmm.generation.clip_sums import clip_sums
 from controlmm.motion.body_parts import body_parts
 from controlmm.motion.skeleton import Skeleton
 
-_METRE = {"m": 1.0, "mm": 1000.0}  # in a skeleton's unit
-
 
 @dataclass(frozen=True, eq=False)
 class RelativeTerm:
@@ -48,7 +46,7 @@ class RelativeTerm:
         counted = torch.nn.functional.pad(known, (0, 0, 0, missing)).expand(len(joints), -1, -1)
         hips = {part.name: part.joints[0] for part in body_parts(skeleton)}
         sides = hips["left_leg"], hips["right_leg"]
-        return cls(*_seen_from_root(longer, sides), counted, sides, _METRE[skeleton.unit])
+        return cls(*_seen_from_root(longer, sides), counted, sides, 1 / skeleton.metres)
 
     def values(self, joints: Float[Tensor, "B T J 3"]) -> Float[Tensor, "B"]:
         """See :class:`JointTerm`."""

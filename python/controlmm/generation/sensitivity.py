@@ -16,9 +16,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from controlmm.generation.clip_sums import one_thread
 from controlmm.generation.code_spread import CodeSpread
 from controlmm.generation.frozen_decoder import FrozenDecoder
+from controlmm.generation.one_thread import one_thread
 
 _BITS = 20  # of a row's largest entry: products have 40, and float64 holds sums of 2^13 of them exactly
 WINDOW = 25  # tokens of a sequence; of a channel's answer, less than 2 % comes from farther away than 12

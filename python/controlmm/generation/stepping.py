@@ -40,7 +40,7 @@ def with_steps(
         latents: Where editing would start.
         valid: Tokens of each clip.
         budget: Of the editing that follows.
-        progress: Called after every evaluation.
+        progress: Called after every evaluation, with both rounds as one phase.
     """
     if not budget.naturalness or budget.time_budget is not None or budget.solver == "papers":
         return latents
@@ -56,14 +56,22 @@ def with_steps(
         naturalness=_NATURALNESS * budget.naturalness,
     )
     keep = valid[rows, :, None].to(latents.dtype)
-    for _ in range(_ROUNDS):
+    for number in range(_ROUNDS):
         targets, mask = chosen.targets.clone(), chosen.mask.clone()
         for row, clip in enumerate(_clips(chosen, stepped)):
             inside = slice(0, len(clip[0]))
             targets[row, inside], mask[row, inside] = step_targets(*clip, skeleton)
         standing = ControlObjective(chosen.decoder, targets, mask, chosen.frames, norm=chosen.norm)
-        stepped = edit_latents(standing, stepped, keep, rounds, progress=progress).latents
+        stepped = edit_latents(standing, stepped, keep, rounds, progress=_of_round(number, progress)).latents
     return latents.index_copy(0, torch.tensor(rows), stepped)
+
+
+def _of_round(number: int, progress: Progress | None) -> Progress | None:
+    """For the editing in a round, whose steps then follow on those of the rounds before."""
+    if progress is None:
+        return None
+    before, total = number * _ITERATIONS, _ROUNDS * _ITERATIONS
+    return lambda _, done, __: progress("planned steps", before + done, total)
 
 
 def _clips(

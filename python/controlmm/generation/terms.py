@@ -17,7 +17,6 @@ from controlmm.motion.skeleton import Skeleton
 from controlmm.ops import PackedObstacles, masked_consistency_loss, obstacle_loss, pack_obstacles
 
 OBSTACLE_WEIGHT = 0.003  # m^2 of squared error for each metre of summed depth
-_METRE = {"m": 1.0, "mm": 1000.0}  # in a skeleton's unit
 
 
 class JointTerm(Protocol):
@@ -193,7 +192,7 @@ def obstacle_terms(
     Raises:
         ValueError: If an obstacle names a joint or a frame that is not there.
     """
-    unit = _METRE[skeleton.unit]
+    unit = 1 / skeleton.metres
     groups: dict[tuple[tuple[int, ...] | None, float], list[Avoid]] = {}
     for obstacle in obstacles:
         key = obstacle.joint_indices(skeleton), unit * (obstacle.margin + obstacle.joint_radius)

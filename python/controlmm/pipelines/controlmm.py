@@ -14,13 +14,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from controlmm.controls import Avoid, Control, Objective, Obstacle
-from controlmm.generation.clip_sums import one_thread
 from controlmm.generation.decoding_request import DecodingRequest
 from controlmm.generation.frozen_layers import has_fast_bfloat16
 from controlmm.generation.latent_editing import edit_latents
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.noise import ClipNoise
 from controlmm.generation.objective import ControlObjective
+from controlmm.generation.one_thread import one_thread
 from controlmm.generation.packed_networks import PackedCopies
 from controlmm.generation.planted_feet import with_planted_feet
 from controlmm.generation.solvers import Progress

@@ -13,9 +13,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controlmm.controls import Avoid, Control, Objective, Obstacle, TimelineEntry
-from controlmm.generation.clip_sums import one_thread
 from controlmm.generation.exact import ExactReport, meet_exactly
 from controlmm.generation.noise import clip_seeds
+from controlmm.generation.one_thread import one_thread
 from controlmm.generation.solvers import Progress
 from controlmm.generation.terms import JointTerm
 from controlmm.models.length_estimator import LengthEstimator

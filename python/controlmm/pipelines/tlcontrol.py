@@ -14,10 +14,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from controlmm.controls import Avoid, Control, Objective, Obstacle
-from controlmm.generation.clip_sums import one_thread
 from controlmm.generation.code_optimization import optimize_codes
 from controlmm.generation.code_prediction import CodePrediction
 from controlmm.generation.motion_decoder import MotionDecoder
+from controlmm.generation.one_thread import one_thread
 from controlmm.generation.solvers import Progress, Solution
 from controlmm.generation.terms import JointTerm
 from controlmm.models.length_estimator import LengthEstimator

@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from controlmm.generation.clip_sums import one_thread
 from controlmm.generation.exact.bones import restore_bones
 from controlmm.generation.exact.projection import project_on_targets
 from controlmm.generation.exact.refit import refit_features
+from controlmm.generation.one_thread import one_thread
 from controlmm.motion.features import bone_lengths
 from controlmm.motion.layout import feature_layout
 from controlmm.motion.skeleton import Skeleton
@@ -21,7 +21,6 @@ from controlmm.ops import recover_joints
 _PLANTED_SPEED = 1.0  # metres a second; a foot in contact that is faster is no longer standing
 _CONTACT = 0.5  # of the contact channels
 _NOTHING = 1e-4  # of the skeleton's unit: a motion so near its targets, with such bones, stays as it is
-_PER_METRE = {"m": 1.0, "mm": 1000.0}
 
 
 @dataclass(frozen=True)
@@ -85,7 +84,7 @@ def _report(
     planted = planted_feet(features, clips[0], skeleton)
 
     def both(measure: Callable[[Tensor], float]) -> tuple[float, float]:
-        before, after = (measure(clip) / _PER_METRE[skeleton.unit] for clip in clips)
+        before, after = (measure(clip) * skeleton.metres for clip in clips)
         return before, after
 
     return ExactReport(
@@ -102,7 +101,7 @@ def planted_feet(
     """Joints of the feet that stand in a frame and the next: in contact, and slower than 1 m/s."""
     feet = skeleton.foot_joints
     in_contact = features[:, feature_layout(skeleton).foot_contacts] > _CONTACT
-    speed = joints[:, feet][..., [0, 2]].diff(dim=0).norm(dim=-1) * skeleton.fps / _PER_METRE[skeleton.unit]
+    speed = joints[:, feet][..., [0, 2]].diff(dim=0).norm(dim=-1) * skeleton.fps * skeleton.metres
     stands = in_contact[:-1] & in_contact[1:] & (speed < _PLANTED_SPEED)
     planted = torch.zeros(joints.shape[:2], dtype=torch.bool)
     planted[:-1, list(feet)] = stands

@@ -16,9 +16,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from controlmm.generation.clip_sums import one_thread
 from controlmm.generation.control_residuals import ControlResiduals, Probe
 from controlmm.generation.coordinate_groups import Groups
+from controlmm.generation.one_thread import one_thread
 from controlmm.generation.solvers.clip_search import ClipRecord, Progress, report, solution_of
 from controlmm.generation.solvers.curvature import Curvature
 from controlmm.generation.solvers.metric import Metric
