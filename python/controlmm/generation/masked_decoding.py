@@ -26,6 +26,7 @@ from controlmm.models.control_branch import ControlBranch
 from controlmm.models.masked_transformer import MaskedTransformer
 from controlmm.models.residual_transformer import ResidualTransformer
 from controlmm.models.tokenizer import MotionTokenizer
+from controlmm.nn.row_product import row_product
 
 DECIDED = 1e5  # confidence of tokens that are never masked again
 _RESIDUAL_TOP_SHARE = 0.1  # of the codes can be drawn in residual layers that are drawn
@@ -87,7 +88,7 @@ def decode_with_control(
         if branch is None:
             logits = guided(base_prediction(base, embedded), request)
         else:
-            latents = torch.where(hidden, mean_code, logits.softmax(-1) @ codes) * keep
+            latents = torch.where(hidden, mean_code, row_product(logits.softmax(-1), codes)) * keep
             signal = branch.signal(objective.targets, objective.mask, part.positions(latents))
             hint = branch.hint(signal, valid)
             logits = guided(controlled_prediction(base, branch, embedded, hint), request)
@@ -171,7 +172,7 @@ def final_latents(
     """
     if request.rules.final_tokens == "sampled":
         return tokenizer.quantizer.lookup(ids)
-    soft = token_mixture(logits) @ tokenizer.base_codes * request.valid[..., None]
+    soft = row_product(token_mixture(logits), tokenizer.base_codes) * request.valid[..., None]
     return soft + tokenizer.quantizer.lookup(without_base(ids))
 
 

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from controlmm.nn.checkpoint import PretrainedModel
 from controlmm.nn.dropout import Dropout
+from controlmm.nn.row_product import row_product
 from controlmm.nn.trunk import (
     encoder_layers,
     initialize_weights,
@@ -122,7 +123,7 @@ class MaskedTransformer(PretrainedModel):
 
     def embed_soft(self, probabilities: Float[Tensor, "B L K"]) -> Float[Tensor, "B L E"]:
         """Embeddings of soft (differentiable) tokens."""
-        return probabilities @ self.token_embedding.weight[: self.config.codebook_size]
+        return row_product(probabilities, self.token_embedding.weight[: self.config.codebook_size])
 
     def sequence(
         self, embedded: Float[Tensor, "B L E"], text: Float[Tensor, "B D"]

@@ -14,6 +14,7 @@ from torch.nn.functional import one_hot, pad
 from controlmm.models.masked_transformer import with_text_token
 from controlmm.nn.checkpoint import PretrainedModel
 from controlmm.nn.dropout import Dropout
+from controlmm.nn.row_product import row_product
 from controlmm.nn.trunk import (
     encoder_layers,
     initialize_weights,
@@ -181,7 +182,7 @@ class ResidualTransformer(PretrainedModel):
         """Products with the rows of each clip's table."""
         tables = self.output_tables()
         if (layer == layer[0]).all():  # as in generation: no copy of the table for every clip
-            return predicted @ tables[layer[0] - 1].T
+            return row_product(predicted, tables[layer[0] - 1].T)
         return torch.einsum("ble,bre->blr", predicted, tables[layer - 1])
 
 

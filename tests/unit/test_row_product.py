@@ -1,0 +1,27 @@
+"""Products of rows: right, and the same to the bit in any company, also where they are few."""
+
+from __future__ import annotations
+
+import torch
+
+from controlmm.nn.row_product import row_product
+
+ROUNDING = 1e-5  # of float32 sums of 512 products
+
+
+def test_a_row_is_the_same_in_any_company():
+    generator = torch.Generator().manual_seed(0)
+    rows = torch.randn(1, 200, 512, generator=generator).softmax(-1)
+    for matrix in (torch.randn(512, 48, generator=generator), torch.randn(48, 512, generator=generator).T):
+        together = row_product(rows, matrix)
+        torch.testing.assert_close(together, rows @ matrix, rtol=ROUNDING, atol=ROUNDING)
+        for count in (*range(1, 30), 49, 98):
+            assert torch.equal(row_product(rows[:, :count], matrix), together[:, :count])
+            assert torch.equal(row_product(rows[:, -count:], matrix), together[:, -count:])
+
+
+def test_rows_have_gradients():
+    rows = torch.randn(2, 3, 5, generator=torch.Generator().manual_seed(1)).requires_grad_()
+    matrix = torch.eye(5)[:, :4]
+    (gradient,) = torch.autograd.grad(row_product(rows, matrix).sum(), rows)
+    assert torch.equal(gradient, matrix.sum(1).expand_as(rows))
