@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 import pytest
@@ -32,12 +33,20 @@ PLANS = {
 }
 
 
+@contextmanager
+def threads(count: int) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
 @pytest.fixture
 def two_threads() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    yield
-    torch.set_num_threads(before)
+    with threads(2):
+        yield
 
 
 def latents_of(pipeline: ControlMM, clips: list[int], plan: Preset, *, is_free: bool) -> list[torch.Tensor]:
@@ -66,7 +75,7 @@ def assert_in_company(pipeline: ControlMM, plan: Preset, *, is_free: bool = Fals
         plan = replace(plan, budget=replace(plan.budget, latent_iterations=STEPS))
     together = latents_of(pipeline, [0, 1, 2, 3], plan, is_free=is_free)
     for clips in [[3, 2, 1], [0], [1], [2]]:
-        with one_thread():
+        with threads(1):
             others = latents_of(pipeline, clips, plan, is_free=is_free)
         for clip, latents in zip(clips, others, strict=True):
             assert torch.equal(latents, together[clip])
@@ -90,7 +99,7 @@ def test_motions_of_a_call(tiny_pipeline, preset):
     goal = JointControl("right_wrist", frames=[10, 20], positions=[[0.2, 1.0, 0.3], [0.4, 1.0, 0.6]])
     call = {"frames": 24, "controls": [goal], "preset": preset, "seed": 3}
     many = tiny_pipeline("a person waves", samples=2, **call)
-    with one_thread():
+    with threads(1):
         one = tiny_pipeline("a person waves", samples=1, **call)
     assert torch.equal(one.latents[0], many.latents[0])
     assert torch.equal(one.motions[0].joints, many.motions[0].joints)
@@ -106,7 +115,7 @@ def test_decoded_clips(tiny_pipeline):
     expected = decoder.features(latents, frames)
     torch.testing.assert_close(together, expected, rtol=ROUNDING, atol=20 * ROUNDING)
     for clip, length in enumerate([48, 8, 28]):
-        with one_thread():
+        with threads(1):
             alone = decoder.clip_features(latents[clip : clip + 1, : length // 4])
         assert torch.equal(alone[0], together[clip, :length])
         joints = recover_joints(together, joints=22)[clip, :length]
@@ -147,7 +156,7 @@ def test_products_of_channels_do_not_depend_on_the_channels_beside_them():
         Sensitivity(torch.randn(1, 4, 25, 48, generator=generator), torch.zeros(1, 4)) for _ in range(9)
     ]
     whole = Sensitivity.joined(channels).gram(12)
-    with one_thread():
+    with threads(1):
         part = Sensitivity.joined([channels[1], channels[6]]).gram(5)
     assert torch.equal(part, whole[[1, 6], :20][:, :, [1, 6], :20])
     row = channels[6].mean[0, 2]

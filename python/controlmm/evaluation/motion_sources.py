@@ -13,7 +13,7 @@ from torch import Tensor
 
 from controlmm.evaluation.random_streams import stream_seed
 from controlmm.evaluation.test_set import MAX_FRAMES, Sample
-from controlmm.generation.exact import meet_exactly
+from controlmm.generation.exact import all_meet_exactly
 from controlmm.models.rvq_vae import frame_mask
 from controlmm.ops import recover_joints
 from controlmm.pipelines.pipeline import MotionPipeline
@@ -163,13 +163,13 @@ class Generated:
         )
 
     def _meet_targets(self, features: Float[Tensor, "B T D"], batch: Batch) -> None:
-        """The pipeline's exact mode, clip by clip, in place."""
+        """The pipeline's exact mode for each clip that has targets, in place."""
         mask = batch.mask[..., None].expand_as(batch.joints)
-        for clip, length in enumerate(batch.lengths.tolist()):
-            if mask[clip].any():
-                features[clip, :length], _ = meet_exactly(
-                    features[clip, :length],
-                    batch.joints[clip, :length],
-                    mask[clip, :length],
-                    self.pipeline.skeleton,
-                )
+        rows = batch.mask.flatten(1).any(1).nonzero()[:, 0].tolist()
+        lengths = batch.lengths.tolist()
+        clips = []
+        for row in rows:
+            frames = slice(lengths[row])
+            clips.append((features[row, frames], batch.joints[row, frames], mask[row, frames]))
+        for row, (met, _) in zip(rows, all_meet_exactly(clips, self.pipeline.skeleton), strict=True):
+            features[row, : lengths[row]] = met

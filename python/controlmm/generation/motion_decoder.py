@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
@@ -17,7 +19,10 @@ from controlmm.nn.quantizer import ResidualQuantizer
 from controlmm.ops import recover_joints
 
 _SEQUENCES, _SEED = 6, 1  # of random codes
-_REMEMBERED = 4  # matrices of channel products; each may take 50 MB
+_REMEMBERED = 200_000_000  # bytes of channel products: four choices of six joints
+# Shares of a batch fill the caches at once. They need the same, so one makes it and the others wait; none may
+# clear what another is about to return.
+_FILLING = threading.RLock()
 
 
 class MotionDecoder(nn.Module):
@@ -41,35 +46,41 @@ class MotionDecoder(nn.Module):
         """The decoder's convolutions packed for editing; packed again when its weights have changed."""
         weights = self.tokenizer.decoder
         version = tuple(x for p in weights.parameters() for x in (p.data_ptr(), p._version))
-        if self._packed_version != version:
-            self._packed_version = version
-            self._frozen.clear()
-            self._sensitivities.clear()
-            self._grams.clear()
-        if dtype not in self._frozen:
-            self._frozen[dtype] = FrozenDecoder(weights, dtype=dtype)
-        return self._frozen[dtype]
+        with _FILLING:
+            if self._packed_version != version:
+                self._packed_version = version
+                self._frozen.clear()
+                self._sensitivities.clear()
+                self._grams.clear()
+            if dtype not in self._frozen:
+                self._frozen[dtype] = FrozenDecoder(weights, dtype=dtype)
+            return self._frozen[dtype]
 
     def channel_gram(self, channels: tuple[int, ...], tokens: int) -> Float[Tensor, "D T D T"]:
         """Products of the rows of the decoder's Jacobian, in the unit of :meth:`spread`; see ``sensitivity``.
 
-        Each channel is measured once (a fraction of a second for a joint), products are remembered for a few
+        Each channel is measured once (a fraction of a second for a joint), products are remembered for some
         choices. A shorter clip takes a part of what a longer one had.
         """
-        frozen, spread = self.frozen(), self.spread()
-        unknown = [channel for channel in channels if channel not in self._sensitivities]
-        for channel in unknown:  # one by one: it is the same then whatever is measured beside it
-            self._sensitivities[channel] = measure_sensitivity(
-                frozen, self.typical_latents(), [channel], downsample=self.downsample, spread=spread
-            )
         frames = tokens * self.downsample
-        if channels not in self._grams or self._grams[channels].shape[1] < frames:
-            self._grams.pop(channels, None)
-            while len(self._grams) >= _REMEMBERED:
-                self._grams.pop(next(iter(self._grams)))
-            own = Sensitivity.joined([self._sensitivities[channel] for channel in channels])
-            self._grams[channels] = own.gram(tokens)
-        return self._grams[channels][:, :frames, :, :frames]
+        with _FILLING:
+            frozen, spread = self.frozen(), self.spread()
+            unknown = [channel for channel in channels if channel not in self._sensitivities]
+            for channel in unknown:  # one by one: it is the same then whatever is measured beside it
+                self._sensitivities[channel] = measure_sensitivity(
+                    frozen, self.typical_latents(), [channel], downsample=self.downsample, spread=spread
+                )
+            if channels not in self._grams or self._grams[channels].shape[1] < frames:
+                self._grams.pop(channels, None)
+                own = Sensitivity.joined([self._sensitivities[channel] for channel in channels])
+                self._remember(channels, own.gram(tokens))
+            return self._grams[channels][:, :frames, :, :frames]
+
+    def _remember(self, channels: tuple[int, ...], gram: Float[Tensor, "D T D T"]) -> None:
+        """Keep products, and forget the oldest ones that there is no more room for."""
+        self._grams[channels] = gram
+        while len(self._grams) > 1 and sum(known.nbytes for known in self._grams.values()) > _REMEMBERED:
+            self._grams.pop(next(iter(self._grams)))
 
     def spread(self) -> CodeSpread:
         """The unit of steps in latent space, of a residual tokenizer."""
@@ -77,12 +88,13 @@ class MotionDecoder(nn.Module):
         assert isinstance(quantizer, ResidualQuantizer)  # only its sums of codes have one spread
         books = [quantizer.book(layer).codes for layer in range(self.tokenizer.config.num_quantizers)]
         version = tuple(x for codes in books for x in (codes.data_ptr(), codes._version))
-        if self._spread is None or self._spread[0] != version:
-            with one_thread():
-                self._spread = version, CodeSpread.of_codebooks(books)
-            self._sensitivities.clear()
-            self._grams.clear()
-        return self._spread[1]
+        with _FILLING:
+            if self._spread is None or self._spread[0] != version:
+                with one_thread():
+                    self._spread = version, CodeSpread.of_codebooks(books)
+                self._sensitivities.clear()
+                self._grams.clear()
+            return self._spread[1]
 
     @one_thread()
     def code_deviation(self) -> float:

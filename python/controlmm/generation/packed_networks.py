@@ -8,6 +8,7 @@ threads, to the bit, as long as they share a length and nothing is padded.
 from __future__ import annotations
 
 import copy
+import threading
 from typing import TypeVar, cast
 from weakref import WeakKeyDictionary
 
@@ -21,6 +22,7 @@ from controlmm.generation.frozen_layers import Activation, FrozenMatrix
 _HEAD = "head"  # makes the logits, whose differences count: float32 always
 _Network = TypeVar("_Network", bound=nn.Module)
 _Version = tuple[int, ...]  # of the weights: where they are and how often they were written
+_PACKING = threading.Lock()  # shares of a batch ask for the same copy at once: one packs it, the others wait
 
 
 def packed_copy(network: _Network, dtype: torch.dtype) -> _Network:
@@ -46,11 +48,12 @@ class PackedCopies:
 
     def of(self, network: _Network, dtype: torch.dtype) -> _Network:
         """The copy of ``network`` that multiplies in ``dtype``."""
-        copies = self._known.setdefault(network, {})
         version = tuple(x for weight in network.parameters() for x in (weight.data_ptr(), weight._version))
-        if dtype not in copies or copies[dtype][0] != version:
-            copies[dtype] = version, packed_copy(network, dtype)
-        return cast(_Network, copies[dtype][1])
+        with _PACKING:
+            copies = self._known.setdefault(network, {})
+            if dtype not in copies or copies[dtype][0] != version:
+                copies[dtype] = version, packed_copy(network, dtype)
+            return cast(_Network, copies[dtype][1])
 
 
 def _pack_children(module: nn.Module, dtype: torch.dtype) -> None:

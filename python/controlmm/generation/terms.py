@@ -168,6 +168,13 @@ class OnFloor:
         return OnFloor(self.term.select(clips), self.lengths[clips])
 
 
+def is_callers(term: JointTerm) -> bool:
+    """Whether a function of the caller's is in it, which may look at a whole batch and knows no threads."""
+    while isinstance(term, Placed | OnFloor):
+        term = term.term
+    return isinstance(term, ObjectiveTerm)
+
+
 def obstacle_terms(
     obstacles: Sequence[Avoid],
     *,

@@ -14,18 +14,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from controlmm.controls import Avoid, Control, Objective, Obstacle
-from controlmm.generation.decoding_request import DecodingRequest
 from controlmm.generation.frozen_layers import has_fast_bfloat16
 from controlmm.generation.latent_editing import edit_latents
 from controlmm.generation.motion_decoder import MotionDecoder
-from controlmm.generation.noise import ClipNoise
 from controlmm.generation.objective import ControlObjective
-from controlmm.generation.one_thread import one_thread
+from controlmm.generation.one_thread import allowed_threads, one_thread
 from controlmm.generation.packed_networks import PackedCopies
-from controlmm.generation.planted_feet import with_planted_feet
+from controlmm.generation.shares import in_shares
 from controlmm.generation.solvers import Progress
-from controlmm.generation.stepping import with_steps
-from controlmm.generation.terms import JointTerm
+from controlmm.generation.terms import JointTerm, is_callers
 from controlmm.models.control_branch import ControlBranch
 from controlmm.models.length_estimator import LengthEstimator
 from controlmm.models.masked_transformer import MaskedTransformer
@@ -37,12 +34,12 @@ from controlmm.motion.normalizer import Normalizer
 from controlmm.nn.checkpoint import PretrainedModel
 from controlmm.pipelines.adjusting import adjusted
 from controlmm.pipelines.checks import check_masks_end, check_sizes
+from controlmm.pipelines.clip_batch import ClipBatch
 from controlmm.pipelines.guidance import PUBLISHED, Guidance
 from controlmm.pipelines.motion_editing import run_edit
 from controlmm.pipelines.output import GenerationResult
 from controlmm.pipelines.pipeline import MotionPipeline
 from controlmm.pipelines.presets import Preset, resolve_preset, with_limits
-from controlmm.pipelines.token_drawing import drawn_latents, latents_from_text
 from controlmm.text import TextEncoder
 
 _Network = TypeVar("_Network", bound=nn.Module)
@@ -262,46 +259,13 @@ class ControlMM(MotionPipeline[Preset]):
         tokens = torch.tensor([-(-length // step) for length in lengths])
         valid = frame_mask(tokens, int(tokens.max()))
         targets, mask = (_padded(dense, valid.shape[1] * step) for dense in (targets, mask))
-        is_controlled = mask.flatten(1).any(1)
-        latents = torch.zeros(*valid.shape, self.decoder.tokenizer.config.code_dim)
-
-        def request_for(rows: Tensor) -> DecodingRequest:
-            return DecodingRequest(
-                text[rows],
-                valid[rows],
-                ClipNoise([seeds[row] for row in rows.tolist()]),
-                steps=preset.steps,
-                guidance_scale=self.guidance.under(preset).base,
-                rules=preset.rules,
-                progress=progress,
-                dtype=self.drawing_dtype(preset),
-            )
-
-        free, controlled = (~is_controlled).nonzero()[:, 0], is_controlled.nonzero()[:, 0]
-        for rows, branch in ((free, None), (controlled, self.control)):
-            if not len(rows):
-                continue
-            request = request_for(rows)
-            if branch is None and not terms:
-                drawn = latents_from_text(self, request, preset)
-                strength = preset.budget.naturalness
-                latents[rows] = with_planted_feet(
-                    self.decoder, drawn, request.valid, strength=strength, progress=progress
-                )
-                continue
-            objective = ControlObjective(
-                self.decoder,
-                targets[rows],
-                mask[rows],
-                valid[rows].repeat_interleave(step, dim=1),
-                norm=preset.control_norm,
-                terms=[term.select(rows) for term in terms],
-            )
-            drawn = drawn_latents(self, request, objective, branch, preset)
-            drawn = with_steps(objective, drawn, request.valid, preset.budget, progress=progress)
-            keep = request.valid[..., None].float()
-            latents[rows] = edit_latents(objective, drawn, keep, preset.budget, progress=progress).latents
-        return latents
+        batch = ClipBatch(text, valid, targets, mask, seeds, terms)
+        return in_shares(
+            lambda rows, report: batch.select(rows).latents(self, preset, report),
+            batch.costs,
+            threads=_threads(preset, terms),
+            progress=progress,
+        )
 
     def drawing_dtype(self, preset: Preset) -> torch.dtype:
         """In which the networks that draw tokens multiply. Published ones keep to what they were made in."""
@@ -325,11 +289,27 @@ class ControlMM(MotionPipeline[Preset]):
     ) -> Float[Tensor, "B L C"]:
         """See :class:`MotionPipeline`."""
         frames = valid.repeat_interleave(self.decoder.downsample, dim=1)
-        objective = ControlObjective(
-            self.decoder, targets, mask, frames, norm=preset.control_norm, terms=terms
-        )
         keep = valid[..., None].float()
-        return edit_latents(objective, latents, keep, preset.budget, progress=progress).latents
+
+        def refine(rows: Tensor, report: Progress | None) -> Tensor:
+            objective = ControlObjective(
+                self.decoder,
+                targets[rows],
+                mask[rows],
+                frames[rows],
+                norm=preset.control_norm,
+                terms=[term.select(rows) for term in terms],
+            )
+            return edit_latents(objective, latents[rows], keep[rows], preset.budget, progress=report).latents
+
+        costs = valid.sum(1).tolist()
+        return in_shares(refine, costs, threads=_threads(preset, terms), progress=progress)
+
+
+def _threads(preset: Preset, terms: Sequence[JointTerm]) -> int:
+    """Into how many shares a batch may go. A time budget and a caller's function are for all of it."""
+    is_whole = preset.budget.time_budget is not None or any(is_callers(term) for term in terms)
+    return 1 if is_whole else allowed_threads()
 
 
 def _padded(dense: Tensor, frames: int) -> Tensor:

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controlmm.controls import Avoid, Control, Objective, Obstacle, TimelineEntry
-from controlmm.generation.exact import ExactReport, meet_exactly
+from controlmm.generation.exact import ExactReport, all_meet_exactly
 from controlmm.generation.noise import clip_seeds
 from controlmm.generation.one_thread import one_thread
 from controlmm.generation.solvers import Progress
@@ -174,10 +174,9 @@ class MotionPipeline(PretrainedPipeline, ABC, Generic[_Plan]):
         features = self.decoder.clip_features(latents)[:, : scene.frames]
         reports: list[ExactReport] = []
         if is_exact:
-            for clip, edited in enumerate(features):
-                features[clip], report = meet_exactly(
-                    edited, canonical.targets, canonical.mask, self.skeleton
-                )
+            clips = [(edited, canonical.targets, canonical.mask) for edited in features]
+            for clip, (met, report) in enumerate(all_meet_exactly(clips, self.skeleton)):
+                features[clip] = met
                 reports.append(report)
         seconds_taken = time.perf_counter() - started
         return scene.result(features, latents, seconds_taken=seconds_taken, exact=tuple(reports))

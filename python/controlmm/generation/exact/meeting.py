@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float
@@ -13,6 +14,8 @@ from controlmm.generation.exact.bones import restore_bones
 from controlmm.generation.exact.projection import project_on_targets
 from controlmm.generation.exact.refit import refit_features
 from controlmm.generation.one_thread import one_thread
+from controlmm.generation.side_by_side import side_by_side
+from controlmm.generation.solvers import Progress
 from controlmm.motion.features import bone_lengths
 from controlmm.motion.layout import feature_layout
 from controlmm.motion.skeleton import Skeleton
@@ -70,6 +73,18 @@ def meet_exactly(
     fitted = refit_features(features, moved, skeleton)
     after = recover_joints(fitted[None], joints=skeleton.num_joints)[0].double()
     return fitted, _report((joints, after), targets, mask, features, lengths, skeleton)
+
+
+def all_meet_exactly(
+    clips: Sequence[tuple[Float[Tensor, "T D"], Float[Tensor, "T J 3"], Bool[Tensor, "T J 3"]]],
+    skeleton: Skeleton,
+) -> list[tuple[Float[Tensor, "T D"], ExactReport]]:
+    """:func:`meet_exactly` for (features, targets, mask) of several clips, side by side."""
+
+    def meet(clip: int, _: Progress | None) -> tuple[Float[Tensor, "T D"], ExactReport]:
+        return meet_exactly(*clips[clip], skeleton)
+
+    return side_by_side([partial(meet, clip) for clip in range(len(clips))])
 
 
 def _report(
