@@ -90,6 +90,29 @@ def test_neighbours_of_frames(frames, distance):
     assert torch.equal(neighbours(x, distance), expected)
 
 
+def test_neighbours_of_clips_that_lie_end_to_end():
+    clips = [random(1, frames, 5, seed=frames) for frames in (2, 7, 1, 4)]
+    for distance in (1, 3, 9):
+        expected = [neighbours(clip, distance).clone() for clip in clips]
+        neighbours(random(3, 9, 5, seed=1), 2)  # leaves what must not be seen
+        assert torch.equal(neighbours(torch.cat(clips, 1), distance, (2, 7, 1, 4)), torch.cat(expected, 1))
+
+
+def test_clips_that_lie_end_to_end_are_decoded_as_each_by_itself():
+    frozen, lengths = FrozenDecoder(make_decoder()), (5, 1, 13, 2)
+    clips = [random(1, tokens, 8, seed=tokens) for tokens in lengths]
+    seeds = [random(1, 4 * tokens, len(CHANNELS), seed=tokens) for tokens in lengths]
+    features, tape = frozen.forward(torch.cat(clips, 1), CHANNELS, lengths)
+    together = features, frozen.pull(tape, torch.cat(seeds, 1)), frozen.push(tape, torch.cat(clips, 1))
+    alone: list[list[torch.Tensor]] = [[], [], []]
+    for clip, seed in zip(clips, seeds, strict=True):
+        single, own = frozen.forward(clip, CHANNELS)
+        for kept, result in zip(alone, (single, frozen.pull(own, seed), frozen.push(own, clip)), strict=True):
+            kept.append(result)
+    for whole, parts in zip(together, alone, strict=True):
+        assert torch.equal(whole, torch.cat(parts, 1))
+
+
 def test_a_packed_decoder_sees_new_weights(tiny_pipeline):
     decoder, latents = tiny_pipeline.decoder, random(1, 6, 16)
     before, _ = decoder.frozen().forward(latents, CHANNELS)

@@ -1,21 +1,24 @@
-"""Clips of one length, which networks can take together without padding."""
+"""Clips that networks take together: of one length, or laid end to end.
+
+What networks say of a clip then depends neither on the clips beside it nor on how far they reach.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Int
 from torch import Tensor
 
 _TOGETHER = 8  # of 196 frames: what a layer makes of them stays in a processor's caches
+_TOKENS = 392  # of as many, laid end to end
 
 
 def clips_by_length(lengths: Sequence[int]) -> list[tuple[int, Int[Tensor, "N"]]]:
-    """(length, clips) of up to eight clips each; every clip is in one of the groups.
-
-    What networks say of a clip then depends neither on the clips beside it nor on how far they reach.
-    """
+    """(length, clips) of up to eight clips each; every clip is in one of the groups."""
     rows: dict[int, list[int]] = {}
     for clip, length in enumerate(lengths):
         rows.setdefault(length, []).append(clip)
@@ -24,3 +27,48 @@ def clips_by_length(lengths: Sequence[int]) -> list[tuple[int, Int[Tensor, "N"]]
         for length, clips in sorted(rows.items())
         for first in range(0, len(clips), _TOGETHER)
     ]
+
+
+@dataclass(frozen=True, eq=False)
+class EndToEnd:
+    """Some clips of a padded batch without its padding, one behind the other.
+
+    Attributes:
+        clips: Which they are.
+        lengths: Tokens of each.
+        padded: Tokens of the batch.
+        step: Frames of a token.
+    """
+
+    clips: tuple[int, ...]
+    lengths: tuple[int, ...]
+    padded: int
+    step: int
+
+    @cached_property
+    def tokens(self) -> Int[Tensor, "N"]:
+        """Where their tokens are in the flattened batch."""
+        return self._places(1)
+
+    @cached_property
+    def frames(self) -> Int[Tensor, "N"]:
+        """Where their frames are."""
+        return self._places(self.step)
+
+    def _places(self, step: int) -> Int[Tensor, "N"]:
+        spans = zip(self.clips, self.lengths, strict=True)
+        starts = [(clip * self.padded * step, length * step) for clip, length in spans]
+        return torch.cat([torch.arange(start, start + length) for start, length in starts])
+
+
+def clips_end_to_end(lengths: Sequence[int], *, padded: int, step: int) -> list[EndToEnd]:
+    """All clips in their order, as many in a group as networks take well; ``lengths`` are tokens."""
+    groups: list[list[int]] = []
+    room = 0
+    for clip, length in enumerate(lengths):
+        if length > room:
+            groups.append([])
+            room = _TOKENS
+        groups[-1].append(clip)
+        room -= length
+    return [EndToEnd(tuple(clips), tuple(lengths[clip] for clip in clips), padded, step) for clips in groups]

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from controlmm.generation.frozen_layers import FrozenConv
+from controlmm.generation.frozen_layers import FrozenConv, Lengths
 from controlmm.nn.conv import ConvDecoder, ResidualConvBlock, ResidualStack
 
 
@@ -23,14 +23,15 @@ class Tape:
     """What a pass through the decoder leaves for its Jacobian: inputs of rectifiers, in their order."""
 
     channels: tuple[int, ...]
+    lengths: Lengths
     entry: Float[Tensor, "B L C"]
     blocks: tuple[tuple[Float[Tensor, "B T C"], Float[Tensor, "B T C"]], ...]
     smooth: Float[Tensor, "B T C"]
 
     def select(self, clips: Tensor) -> Tape:
-        """The tape of some of the clips; a clip may be named many times."""
+        """The tape of some of the clips, of a row each; a clip may be named many times."""
         blocks = tuple((inner[clips], hidden[clips]) for inner, hidden in self.blocks)
-        return Tape(self.channels, self.entry[clips], blocks, self.smooth[clips])
+        return Tape(self.channels, (), self.entry[clips], blocks, self.smooth[clips])
 
 
 class _Block:
@@ -40,7 +41,7 @@ class _Block:
 
 
 class FrozenDecoder:
-    """A frozen copy of a :class:`ConvDecoder`; clips of one batch have the same number of tokens.
+    """A frozen copy of a :class:`ConvDecoder`, for clips of one length or for clips that lie end to end.
 
     Args:
         decoder: Where the weights come from. Later changes of it are not seen.
@@ -60,47 +61,59 @@ class FrozenDecoder:
         self._exits: dict[tuple[int, ...], FrozenConv] = {}
 
     def forward(
-        self, latents: Float[Tensor, "B L C"], channels: Sequence[int]
+        self, latents: Float[Tensor, "B L C"], channels: Sequence[int], lengths: Lengths = ()
     ) -> tuple[Float[Tensor, "B T D"], Tape]:
-        """Normalised features, only ``channels`` of them, and what the Jacobian products need."""
-        x = entry = self._entry.forward(latents.to(self._dtype), is_rectified=True)
+        """Normalised features, only ``channels`` of them, and what the Jacobian products need.
+
+        Each row is a clip, or there is one row of clips of ``lengths`` tokens.
+        """
+        tape_lengths = lengths
+        x = entry = self._entry.forward(latents.to(self._dtype), lengths, is_rectified=True)
         saved = []
         for stack, up in zip(self._stacks, self._ups, strict=True):
             for block in stack:
-                hidden = block.dilated.forward(x.clamp_min(0), is_rectified=True)
+                hidden = block.dilated.forward(x.clamp_min(0), lengths, is_rectified=True)
                 saved.append((x, hidden))
                 x = x + block.pointwise.forward(hidden)
-            x = up.forward(_doubled(x))
-        smooth = self._smooth.forward(x, is_rectified=True)
-        tape = Tape(tuple(channels), entry, tuple(saved), smooth)
-        return self._exit_for(tape.channels).forward(smooth).to(latents.dtype), tape
+            lengths = _twice(lengths)
+            x = up.forward(_doubled(x), lengths)
+        smooth = self._smooth.forward(x, lengths, is_rectified=True)
+        tape = Tape(tuple(channels), tape_lengths, entry, tuple(saved), smooth)
+        return self._exit_for(tape.channels).forward(smooth, lengths).to(latents.dtype), tape
 
     def pull(self, tape: Tape, gradient: Float[Tensor, "B T D"]) -> Float[Tensor, "B L C"]:
         """Gradient in the latents, given that in the features: the transposed Jacobian times a vector."""
-        dtype = gradient.dtype
-        gradient = self._exit_for(tape.channels).backward(gradient.to(self._dtype))
-        gradient = self._smooth.backward(_switched(gradient, tape.smooth))
+        dtype, scales = gradient.dtype, [tape.lengths]
+        for _ in self._stacks:
+            scales.append(_twice(scales[-1]))
+        lengths = scales.pop()
+        gradient = self._exit_for(tape.channels).backward(gradient.to(self._dtype), lengths)
+        gradient = self._smooth.backward(_switched(gradient, tape.smooth), lengths)
         saved = list(tape.blocks)
         for stack, up in zip(reversed(self._stacks), reversed(self._ups), strict=True):
-            gradient = up.backward(gradient).unflatten(1, (-1, 2)).sum(2)
+            gradient = up.backward(gradient, lengths).unflatten(1, (-1, 2)).sum(2)
+            lengths = scales.pop()
             for block in reversed(stack):
                 x, hidden = saved.pop()
-                inner = block.dilated.backward(_switched(block.pointwise.backward(gradient), hidden))
-                gradient = gradient + _switched(inner, x)
-        return self._entry.backward(_switched(gradient, tape.entry)).to(dtype)
+                inner = _switched(block.pointwise.backward(gradient), hidden)
+                gradient = gradient + _switched(block.dilated.backward(inner, lengths), x)
+        return self._entry.backward(_switched(gradient, tape.entry), lengths).to(dtype)
 
     def push(self, tape: Tape, tangent: Float[Tensor, "B L C"]) -> Float[Tensor, "B T D"]:
         """Change of the features for a small change of the latents: the Jacobian times a vector."""
-        x = _switched(self._entry.forward(tangent.to(self._dtype), is_tangent=True), tape.entry)
+        lengths = tape.lengths
+        x = self._entry.forward(tangent.to(self._dtype), lengths, is_tangent=True)
+        x = _switched(x, tape.entry)
         saved = iter(tape.blocks)
         for stack, up in zip(self._stacks, self._ups, strict=True):
             for block in stack:
                 before, hidden = next(saved)
-                inner = _switched(block.dilated.forward(_switched(x, before), is_tangent=True), hidden)
-                x = x + block.pointwise.forward(inner, is_tangent=True)
-            x = up.forward(_doubled(x), is_tangent=True)
-        x = _switched(self._smooth.forward(x, is_tangent=True), tape.smooth)
-        return self._exit_for(tape.channels).forward(x, is_tangent=True).to(tangent.dtype)
+                inner = block.dilated.forward(_switched(x, before), lengths, is_tangent=True)
+                x = x + block.pointwise.forward(_switched(inner, hidden), is_tangent=True)
+            lengths = _twice(lengths)
+            x = up.forward(_doubled(x), lengths, is_tangent=True)
+        x = _switched(self._smooth.forward(x, lengths, is_tangent=True), tape.smooth)
+        return self._exit_for(tape.channels).forward(x, lengths, is_tangent=True).to(tangent.dtype)
 
     def _exit_for(self, channels: tuple[int, ...]) -> FrozenConv:
         if channels not in self._exits:
@@ -112,6 +125,10 @@ class FrozenDecoder:
 
 def _doubled(x: Float[Tensor, "B T C"]) -> Float[Tensor, "B 2T C"]:
     return x.repeat_interleave(2, dim=1)
+
+
+def _twice(lengths: Lengths) -> Lengths:
+    return tuple(2 * length for length in lengths)
 
 
 def _switched(gradient: Float[Tensor, "B T C"], x: Float[Tensor, "B T C"]) -> Float[Tensor, "B T C"]:

@@ -11,10 +11,11 @@ from __future__ import annotations
 import math
 import os
 import threading
+from functools import lru_cache
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 _TYPICAL_ROWS = 196  # the frames of one clip: what packing prepares for
@@ -23,6 +24,7 @@ _TYPICAL_ROWS = 196  # the frames of one clip: what packing prepares for
 _WIDEST_BFLOAT16 = 256
 
 Activation = Literal["none", "relu", "gelu"]
+Lengths = tuple[int, ...]  # of clips that lie end to end
 
 
 def has_fast_bfloat16() -> bool:
@@ -114,27 +116,33 @@ class FrozenConv:
         return cls(conv.weight, conv.bias.detach(), conv.dilation[0], dtype)
 
     def forward(
-        self, x: Float[Tensor, "B T C"], *, is_rectified: bool = False, is_tangent: bool = False
+        self,
+        x: Float[Tensor, "B T C"],
+        lengths: Lengths = (),
+        *,
+        is_rectified: bool = False,
+        is_tangent: bool = False,
     ) -> Float[Tensor, "B T D"]:
-        """The convolution, rectified if asked for; of a tangent: without the bias."""
+        """The convolution, rectified if asked for; of a tangent: without the bias.
+
+        Of one row, ``lengths`` are the frames of the clips that lie in it end to end.
+        """
         activation: Activation = "relu" if is_rectified else "none"
-        product = self._forward(self._rows(x), activation=activation, is_tangent=is_tangent)
-        result: Tensor = product.unflatten(0, x.shape[:2])
-        return result
+        product = self._forward(self._rows(x, lengths), activation=activation, is_tangent=is_tangent)
+        return product.view(*x.shape[:2], -1)
 
-    def backward(self, gradient: Float[Tensor, "B T D"]) -> Float[Tensor, "B T C"]:
+    def backward(self, gradient: Float[Tensor, "B T D"], lengths: Lengths = ()) -> Float[Tensor, "B T C"]:
         """The gradient in the input, given that in the output."""
-        product: Tensor = self._backward(self._rows(gradient)).unflatten(0, gradient.shape[:2])
-        return product
+        return self._backward(self._rows(gradient, lengths)).view(*gradient.shape[:2], -1)
 
-    def _rows(self, x: Float[Tensor, "B T C"]) -> Float[Tensor, "N taps"]:
-        return x.flatten(0, 1) if self._taps == 1 else neighbours(x, self._dilation).flatten(0, 1)
+    def _rows(self, x: Float[Tensor, "B T C"], lengths: Lengths) -> Float[Tensor, "N taps"]:
+        return x.flatten(0, 1) if self._taps == 1 else neighbours(x, self._dilation, lengths).flatten(0, 1)
 
 
-def neighbours(x: Float[Tensor, "B T C"], distance: int) -> Float[Tensor, "B T 3C"]:
+def neighbours(x: Float[Tensor, "B T C"], distance: int, lengths: Lengths = ()) -> Float[Tensor, "B T 3C"]:
     """Every frame between those ``distance`` before and after it, zeros beyond the ends.
 
-    The thread's next call writes over the result.
+    The thread's next call writes over the result. For ``lengths`` see :class:`FrozenConv`.
     """
     batch, frames, channels = x.shape
     rows = _SCRATCH.empty((batch, frames, 3 * channels), x.dtype)
@@ -144,7 +152,23 @@ def neighbours(x: Float[Tensor, "B T C"], distance: int) -> Float[Tensor, "B T 3
     rows[..., channels : 2 * channels] = x
     rows[:, : frames - reach, 2 * channels :] = x[:, reach:]
     rows[:, frames - reach :, 2 * channels :] = 0
+    if len(lengths) > 1:
+        first, last = _ends(lengths, distance)
+        rows[0, :, :channels].index_fill_(0, first, 0)
+        rows[0, :, 2 * channels :].index_fill_(0, last, 0)
     return rows
+
+
+@lru_cache(maxsize=256)
+def _ends(lengths: Lengths, distance: int) -> tuple[Int[Tensor, "N"], Int[Tensor, "M"]]:
+    """The first and the last ``distance`` frames of clips that lie end to end."""
+    first, last, start = [], [], 0
+    for length in lengths:
+        end, reach = start + length, min(distance, length)
+        first.append(torch.arange(start, start + reach))
+        last.append(torch.arange(end - reach, end))
+        start = end
+    return torch.cat(first), torch.cat(last)
 
 
 class _Scratch(threading.local):

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from controlmm.generation.clip_groups import clips_by_length
+from controlmm.generation.clip_groups import clips_end_to_end
 from controlmm.generation.code_spread import CodeSpread
 from controlmm.generation.frozen_decoder import FrozenDecoder
 from controlmm.generation.one_thread import one_thread
@@ -132,8 +132,11 @@ class MotionDecoder(nn.Module):
             frames = torch.ones(len(latents), latents.shape[1] * step, dtype=torch.bool)
         channels = range(len(self.normalizer.mean))
         normalized = torch.zeros(*frames.shape, len(channels))
-        for length, rows in clips_by_length(frames[:, ::step].sum(1).tolist()):
-            normalized[rows, : length * step], _ = frozen.forward(latents[rows, :length], channels)
+        tokens = frames[:, ::step]
+        for group in clips_end_to_end(tokens.sum(1).tolist(), padded=tokens.shape[1], step=step):
+            clips = latents[:, : tokens.shape[1]].flatten(0, 1)[None, group.tokens]
+            decoded, _ = frozen.forward(clips, channels, group.lengths)
+            normalized.flatten(0, 1)[group.frames] = decoded[0]
         return self.normalizer.denormalize(normalized)
 
     def forward(

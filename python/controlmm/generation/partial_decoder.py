@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from controlmm.generation.clip_groups import clips_by_length
+from controlmm.generation.clip_groups import clips_end_to_end
 from controlmm.generation.frozen_decoder import FrozenDecoder, Tape
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.ops import recover_joints
@@ -55,7 +55,9 @@ class PartialDecoder:
         channels = list(self.channels)
         self.mean, self.std = decoder.normalizer.mean[channels], decoder.normalizer.std[channels]
         self._frozen: FrozenDecoder = decoder.frozen(dtype)
-        self.groups = clips_by_length(frames[:, :: decoder.downsample].sum(1).tolist())
+        step = decoder.downsample
+        tokens = frames[:, ::step]
+        self.groups = clips_end_to_end(tokens.sum(1).tolist(), padded=tokens.shape[1], step=step)
 
     def select(self, clips: Int[Tensor, "S"]) -> PartialDecoder:
         """The same for some of the clips."""
@@ -66,9 +68,10 @@ class PartialDecoder:
         step = self.decoder.downsample
         features = latents.new_zeros(len(latents), latents.shape[1] * step, len(self.channels))
         tapes = []
-        for length, rows in self.groups:
-            decoded, tape = self._frozen.forward(latents[rows, :length], self.channels)
-            features[rows, : length * step] = decoded
+        for group in self.groups:
+            clips = latents.flatten(0, 1)[None, group.tokens]
+            decoded, tape = self._frozen.forward(clips, self.channels, group.lengths)
+            features.flatten(0, 1)[group.frames] = decoded[0]
             tapes.append(tape)
         return Decoded(features, tuple(tapes))
 
@@ -82,12 +85,13 @@ class PartialDecoder:
 
     def pull(self, decoded: Decoded, gradient: Float[Tensor, "B T D"]) -> Float[Tensor, "B L C"]:
         """The gradient in the latents, given that in the features of :meth:`decode`."""
-        step = self.decoder.downsample
-        pulled = []
-        for (length, rows), tape in zip(self.groups, decoded.tapes, strict=True):
-            pulled.append(self._frozen.pull(tape, gradient[rows, : length * step]))
+        pulled = [
+            self._frozen.pull(tape, gradient.flatten(0, 1)[None, group.frames])
+            for group, tape in zip(self.groups, decoded.tapes, strict=True)
+        ]
         channels = pulled[0].shape[-1] if pulled else 0
-        latents = gradient.new_zeros(len(gradient), gradient.shape[1] // step, channels)
-        for (length, rows), part in zip(self.groups, pulled, strict=True):
-            latents[rows, :length] = part
+        tokens = gradient.shape[1] // self.decoder.downsample
+        latents = gradient.new_zeros(len(gradient), tokens, channels)
+        for group, part in zip(self.groups, pulled, strict=True):
+            latents.flatten(0, 1)[group.tokens] = part[0]
         return latents
