@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from controlmm.generation.clip_groups import clips_end_to_end
+from controlmm.generation.clip_groups import clips_end_to_end, clips_of_like_length
 
 
 def test_every_clip_lies_in_one_group_of_at_most_eight_long_clips():
@@ -20,6 +20,16 @@ def test_every_clip_lies_in_one_group_of_at_most_eight_long_clips():
     (longer,) = clips_end_to_end([500], padded=500, step=4)
     assert longer.lengths == (500,)
     assert clips_end_to_end([], padded=0, step=4) == []
+
+
+def test_clips_of_like_length_waste_little_on_padding():
+    lengths = torch.randint(2, 50, (70,), generator=torch.Generator().manual_seed(0)).tolist()
+    groups = [group.tolist() for group in clips_of_like_length(lengths)]
+    assert sorted(clip for group in groups for clip in group) == list(range(70))
+    sizes = [len(group) * max(lengths[clip] for clip in group) for group in groups]
+    assert max(sizes) <= 8 * 49
+    assert sum(sizes) < 1.25 * sum(lengths)
+    assert [len(group) for group in clips_of_like_length([49] * 9)] == [8, 1]
 
 
 def test_places_are_those_in_the_flattened_batch():

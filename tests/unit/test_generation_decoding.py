@@ -57,11 +57,11 @@ def test_lowest_scores_are_found_for_each_clip_and_ties_go_by_position():
 def test_guidance_moves_away_from_the_prediction_without_text():
     asked = request([3], scale=4.0)
 
-    def predict(rows, length, text):
-        return text.sum(1)[:, None, None] * torch.ones(len(rows), length, 2) + 1.0
+    def predict(rows, valid, text):
+        return text.sum(1)[:, None, None] * torch.ones(*valid.shape, 2) + 1.0
 
     row = torch.tensor([0])
-    with_text, without = predict(row, 3, asked.text), predict(row, 3, torch.zeros(1, 64))
+    with_text, without = (predict(row, asked.valid, text) for text in (asked.text, torch.zeros(1, 64)))
     torch.testing.assert_close(guided(predict, asked), without + 4 * (with_text - without))
     torch.testing.assert_close(guided(predict, asked, scale=1.0), with_text)
     torch.testing.assert_close(guided(predict, asked, scale=0.0), without)

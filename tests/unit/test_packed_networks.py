@@ -149,6 +149,11 @@ def test_a_clip_has_the_same_bits_in_every_batch(dtype, threads, width, feedforw
             for count in (1, 2, 3, 5, 8, 16):
                 logits = packed(embedded[:count, :length], text[:count], torch.ones(count, length).bool())
                 assert torch.equal(logits, expected[:count])
+        clips, tokens = [3, 0, 5, 1, 2, 4], torch.tensor([49, 2, 20, 49, 20, 2])
+        valid = torch.arange(49) < tokens[:, None]
+        padded = packed(embedded[clips], text[clips], valid)
+        for logits, clip, length in zip(padded, clips, tokens.tolist(), strict=True):
+            assert torch.equal(logits[:length], together[length][clip])
     finally:
         torch.set_num_threads(before)
 

@@ -1,6 +1,7 @@
-"""Clips that networks take together: of one length, or laid end to end.
+"""Clips that networks take together, so that products have many rows.
 
-What networks say of a clip then depends neither on the clips beside it nor on how far they reach.
+What networks say of a clip depends neither on the clips beside it nor on how far they reach: attention takes
+clips of one length, convolutions know where a clip ends.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 _TOGETHER = 8  # of 196 frames: what a layer makes of them stays in a processor's caches
-_TOKENS = 392  # of as many, laid end to end
+_TOKENS = 392  # of as many
 
 
 def clips_by_length(lengths: Sequence[int]) -> list[tuple[int, Int[Tensor, "N"]]]:
@@ -27,6 +28,16 @@ def clips_by_length(lengths: Sequence[int]) -> list[tuple[int, Int[Tensor, "N"]]
         for length, clips in sorted(rows.items())
         for first in range(0, len(clips), _TOGETHER)
     ]
+
+
+def clips_of_like_length(lengths: Sequence[int]) -> list[Int[Tensor, "N"]]:
+    """All clips, from the shortest on, as many in a group as networks take well; padding counts."""
+    groups: list[list[int]] = []
+    for clip in sorted(range(len(lengths)), key=lambda clip: lengths[clip]):
+        if not groups or (len(groups[-1]) + 1) * lengths[clip] > _TOKENS:
+            groups.append([])
+        groups[-1].append(clip)
+    return [torch.tensor(clips) for clips in groups]
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from controlmm.generation.clip_groups import clips_by_length
+from controlmm.generation.clip_groups import clips_of_like_length
 from controlmm.generation.decoding_rules import DecodingRules
 from controlmm.generation.kept_tokens import KeptTokens
 from controlmm.generation.noise import ClipNoise
@@ -42,9 +42,9 @@ class DecodingRequest:
         return counts
 
     @cached_property
-    def groups(self) -> list[tuple[int, Int[Tensor, "N"]]]:
-        """(tokens, clips) that networks take together."""
-        return clips_by_length(self.lengths)
+    def groups(self) -> list[Int[Tensor, "N"]]:
+        """Clips that networks take together."""
+        return clips_of_like_length(self.lengths)
 
     @property
     def drawn(self) -> Bool[Tensor, "B L"]:

@@ -1,7 +1,6 @@
 """Logits of the masked and the residual transformer, guided by the text (classifier-free guidance).
 
-Clips are predicted at their own length, a few of one length at a time, with and without their text in one
-call.
+Clips of like lengths are predicted together, with and without their text in one call.
 """
 
 from __future__ import annotations
@@ -17,15 +16,15 @@ from controlmm.models.control_branch import ControlBranch
 from controlmm.models.masked_transformer import MaskedTransformer
 from controlmm.models.residual_transformer import ResidualTransformer
 
-# (clips, which may be named twice; how many tokens; a text for each) -> logits of these clips and tokens
-Prediction = Callable[[Int[Tensor, "N"], int, Float[Tensor, "N E"]], Float[Tensor, "N L K"]]
+# (clips, which may be named twice; which tokens they have; a text for each) -> logits of these tokens
+Prediction = Callable[[Int[Tensor, "N"], Bool[Tensor, "N L"], Float[Tensor, "N E"]], Float[Tensor, "N L K"]]
 
 
 def base_prediction(base: MaskedTransformer, embedded: Float[Tensor, "B L E"]) -> Prediction:
     """What ``base`` makes of the tokens of a batch."""
 
-    def predict(rows: Tensor, length: int, text: Tensor) -> Tensor:
-        logits: Tensor = base(embedded[rows, :length], text, _all_valid(rows, length))
+    def predict(rows: Tensor, valid: Tensor, text: Tensor) -> Tensor:
+        logits: Tensor = base(embedded[rows, : valid.shape[1]], text, valid)
         return logits
 
     return predict
@@ -39,10 +38,9 @@ def controlled_prediction(
 ) -> Prediction:
     """What ``base`` makes of them with the :meth:`ControlBranch.hint` of each clip."""
 
-    def predict(rows: Tensor, length: int, text: Tensor) -> Tensor:
-        sequence = base.sequence(embedded[rows, :length], text)
-        hints = hint[rows, : sequence.shape[1]]
-        return branch.hinted_logits(base, sequence, hints, _all_valid(rows, length))
+    def predict(rows: Tensor, valid: Tensor, text: Tensor) -> Tensor:
+        sequence = base.sequence(embedded[rows, : valid.shape[1]], text)
+        return branch.hinted_logits(base, sequence, hint[rows, : sequence.shape[1]], valid)
 
     return predict
 
@@ -55,18 +53,13 @@ def residual_prediction(
 ) -> Prediction:
     """What ``residual`` makes of the layers before ``layer``."""
 
-    def predict(rows: Tensor, length: int, text: Tensor) -> Tensor:
-        own = None if hints is None else [hint[rows, :length] for hint in hints]
-        valid = _all_valid(rows, length)
-        logits: Tensor = residual(history[rows, :length], layer[rows], text, valid, hints=own)
+    def predict(rows: Tensor, valid: Tensor, text: Tensor) -> Tensor:
+        longest = valid.shape[1]
+        own = None if hints is None else [hint[rows, :longest] for hint in hints]
+        logits: Tensor = residual(history[rows, :longest], layer[rows], text, valid, hints=own)
         return logits
 
     return predict
-
-
-def _all_valid(rows: Int[Tensor, "N"], length: int) -> Bool[Tensor, "N L"]:
-    """The mask of clips without padding."""
-    return torch.ones(len(rows), length, dtype=torch.bool)
 
 
 def guided(
@@ -74,20 +67,21 @@ def guided(
 ) -> Float[Tensor, "B L K"]:
     """Classifier-free guidance: ``l_0 + s (l_text - l_0)``, where "no text" is the zero vector.
 
-    Zero in padding, which no network sees: a clip is predicted at its own length.
+    Zero in padding, which is for no network to see: packed ones leave it out.
     """
     scale = request.guidance_scale if scale is None else scale
     whole: Tensor | None = None
-    for length, rows in request.groups:
-        text = request.text[rows]
+    for rows in request.groups:
+        text, longest = request.text[rows], max(request.lengths[row] for row in rows.tolist())
+        valid = request.valid[rows, :longest]
         if scale == 1:
-            logits = predict(rows, length, text)
+            logits = predict(rows, valid, text)
         else:
-            both = predict(rows.repeat(2), length, torch.cat([text, torch.zeros_like(text)]))
+            both = predict(rows.repeat(2), valid.repeat(2, 1), torch.cat([text, torch.zeros_like(text)]))
             with_text, without = both.chunk(2)
             logits = without + scale * (with_text - without)
         if whole is None:
             whole = logits.new_zeros(*request.valid.shape, logits.shape[-1])
-        whole[rows, :length] = logits
+        whole[rows, :longest] = logits.where(valid[..., None], 0)
     assert whole is not None  # a request has clips
     return whole

@@ -1,14 +1,15 @@
 """Copies of networks for generation: weights frozen, packed once, and multiplied in bfloat16 where that pays.
 
 A copy is of the class of its network and takes the same arguments; only its linear layers, convolutions and
-transformer layers are others. Its numbers for a clip do not depend on the clips beside it or on the number of
-threads, to the bit, as long as they share a length and nothing is padded.
+transformer layers are others. These leave padding out. What a copy makes of a clip depends neither on padding
+nor on the clips beside it nor on the number of threads, to the bit.
 """
 
 from __future__ import annotations
 
 import copy
 import threading
+from collections.abc import Sequence
 from typing import TypeVar, cast
 from weakref import WeakKeyDictionary
 
@@ -17,6 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.functional import layer_norm, pad, scaled_dot_product_attention
 
+from controlmm.generation.clip_groups import clips_by_length
 from controlmm.generation.frozen_layers import Activation, FrozenMatrix
 
 _HEAD = "head"  # makes the logits, whose differences count: float32 always
@@ -120,7 +122,7 @@ class PackedConv(nn.Module):
 
 
 class PackedEncoderLayer(nn.Module):
-    """A frozen post-norm ``nn.TransformerEncoderLayer``.
+    """A frozen post-norm ``nn.TransformerEncoderLayer`` that makes nothing of padding: zeros.
 
     Attention stays in float32: in bfloat16 a clip's numbers would depend on its batch.
     """
@@ -141,19 +143,37 @@ class PackedEncoderLayer(nn.Module):
         self, hidden: Float[Tensor, "B S W"], src_key_padding_mask: Bool[Tensor, "B S"]
     ) -> Float[Tensor, "B S W"]:
         """As the layer that it is a copy of."""
-        rows = hidden.flatten(0, 1)
-        attended = self._attended(rows, src_key_padding_mask)
+        rows, valid = hidden.flatten(0, 1), ~src_key_padding_mask
+        lengths: list[int] = valid.sum(1).tolist()
+        if not valid.all():
+            rows = rows[valid.flatten()]
+        attended = self._attended(self._inputs(rows), lengths)
         rows = _normalised(self.norm1, rows + self._outputs.raw(attended))
         inner = self._wide.raw(rows, self._activation)
         rows = _normalised(self.norm2, rows + self._narrow.raw(inner))
-        return rows.view(hidden.shape)
+        if len(rows) == valid.numel():
+            return rows.view(hidden.shape)
+        result = torch.zeros_like(hidden)
+        result[valid] = rows
+        return result
 
-    def _attended(self, rows: Float[Tensor, "N W"], padding: Bool[Tensor, "B S"]) -> Float[Tensor, "N W"]:
-        parts = self._inputs(rows).view(*padding.shape, 3, self._heads, -1)
+    def _attended(self, rows: Float[Tensor, "N 3W"], lengths: Sequence[int]) -> Float[Tensor, "N W"]:
+        """Each clip attends to itself; ``rows`` are those of all clips without their padding."""
+        if len(set(lengths)) == 1:
+            return self._attended_alike(rows, lengths[0])
+        starts = torch.tensor([0, *lengths]).cumsum(0)
+        attended = rows.new_empty(len(rows), rows.shape[1] // 3)
+        for length, clips in clips_by_length(lengths):
+            places = (starts[clips, None] + torch.arange(length)).flatten()
+            attended[places] = self._attended_alike(rows[places], length)
+        return attended
+
+    def _attended_alike(self, rows: Float[Tensor, "N 3W"], length: int) -> Float[Tensor, "N W"]:
+        """Of clips of one length."""
+        parts = rows.view(-1, length, 3, self._heads, rows.shape[1] // (3 * self._heads))
         queries, keys, values = parts.permute(2, 0, 3, 1, 4)
-        seen = ~padding[:, None, None, :] if padding.any() else None
-        attended = scaled_dot_product_attention(queries, keys, values, attn_mask=seen)
-        return attended.transpose(1, 2).reshape(rows.shape)
+        attended = scaled_dot_product_attention(queries, keys, values)
+        return attended.transpose(1, 2).reshape(len(rows), -1)
 
 
 def _normalised(norm: nn.LayerNorm, rows: Float[Tensor, "N W"]) -> Float[Tensor, "N W"]:
