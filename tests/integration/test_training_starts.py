@@ -25,7 +25,7 @@ UNTRAINED = 1e-9  # rate at which a step moves no weight by more than the tolera
 MOVED = 1e-6
 
 
-def train(stage, data, root, *, start_from=None, **changes):
+def train(stage, data, root, *, start_from=None, options=None, **changes):
     return train_stage(
         stage,
         data=data,
@@ -34,6 +34,7 @@ def train(stage, data, root, *, start_from=None, **changes):
         text_encoder=HashingTextEncoder(64),
         changes={"steps": 2, "validate_every": 20} | changes,
         start_from=start_from,
+        options=options or {},
         progress=False,
     )
 
@@ -63,6 +64,15 @@ def test_refining_moves_the_decoder_alone_and_improves_whole_clips(model, tiny_d
         r for r in RunFolder(root / "rvq-decoder").records() if r.get("val_score") and r["step"] == STEPS
     ]
     assert {"val_perplexity_0", "val_perplexity_2", "val_local", "val_global"} <= last.keys()
+
+
+@pytest.mark.parametrize("ends", [None, "repeat"])
+def test_a_decoder_may_be_refined_for_other_ends(model, tiny_data_folder, tmp_path, ends):
+    train("rvq-decoder", tiny_data_folder, tmp_path, start_from=model, options={"ends": ends} if ends else {})
+    trained = RvqVae.from_pretrained(model / "tokenizer").config.decoder_ends
+    assert trained == "zeros"
+    refined, _ = load_tokenizer(tmp_path)
+    assert refined.decoder.ends == refined.config.decoder_ends == (ends or trained)
 
 
 def test_a_refined_decoder_of_other_codes_is_refused(model, tiny_data_folder, tmp_path):

@@ -88,6 +88,12 @@ def test_edited_clips(tiny_pipeline, name):
 
 
 @pytest.mark.usefixtures("two_threads")
+def test_edited_clips_whose_ends_are_repeated(tiny_pipeline):
+    tiny_pipeline.decoder.tokenizer.decoder.ends = "repeat"
+    assert_in_company(tiny_pipeline, PRESETS["accurate"])
+
+
+@pytest.mark.usefixtures("two_threads")
 def test_clips_from_text_whose_feet_are_planted(tiny_pipeline):
     assert_in_company(tiny_pipeline, PRESETS["balanced"], is_free=True)
 
@@ -107,8 +113,10 @@ def test_motions_of_a_call(tiny_pipeline, preset):
 
 
 @pytest.mark.usefixtures("two_threads")
-def test_decoded_clips(tiny_pipeline):
+@pytest.mark.parametrize("ends", ["zeros", "repeat"])
+def test_decoded_clips(tiny_pipeline, ends):
     decoder: MotionDecoder = tiny_pipeline.decoder
+    decoder.tokenizer.decoder.ends = ends
     latents = torch.randn(3, 12, 16, generator=torch.Generator().manual_seed(1))
     frames = frame_mask(torch.tensor([48, 8, 28]), 48)
     together = decoder.clip_features(latents, frames)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
+from controlmm.models.part_vq_vae import PartVqVaeConfig
+from controlmm.models.rvq_vae import RvqVaeConfig
 from controlmm.nn.conv import ConvDecoder, ConvEncoder, ResidualStack
 
 SAME_CLIP = 1e-5  # convolutions of another batch size and length sum in another order
@@ -15,10 +17,10 @@ def prefix(lengths: list[int], frames: int) -> torch.Tensor:
     return torch.arange(frames) < torch.tensor(lengths)[:, None]
 
 
-@pytest.fixture
-def networks():
+@pytest.fixture(params=["zeros", "repeat"])
+def networks(request):
     torch.manual_seed(0)
-    return ConvEncoder(7, 5, **SIZES), ConvDecoder(5, 7, **SIZES)
+    return ConvEncoder(7, 5, **SIZES), ConvDecoder(5, 7, **SIZES, ends=request.param)
 
 
 @pytest.mark.parametrize("frames", [4, 8, 40])
@@ -59,3 +61,23 @@ def test_no_gradient_reaches_padding(networks):
     (gradient,) = torch.autograd.grad(decoder(encoder(x, valid), valid).square().sum(), x)
     assert gradient[..., 12:].abs().max() == 0
     assert gradient[..., :12].abs().min() > 0
+
+
+@pytest.mark.parametrize("tokens", [1, 2, 9])
+def test_repeated_ends_are_what_the_first_and_the_last_token_once_more_give(tokens):
+    torch.manual_seed(0)
+    plain = ConvDecoder(5, 7, **SIZES)
+    repeating = ConvDecoder(5, 7, **SIZES, ends="repeat")
+    repeating.load_state_dict(plain.state_dict())
+    x = torch.randn(2, 5, tokens)
+    longer = torch.cat([x[..., :1], x, x[..., -1:]], dim=-1)
+    assert torch.equal(repeating(x), plain(longer)[..., 4:-4])
+    assert not torch.allclose(repeating(x), plain(x))
+
+
+@pytest.mark.parametrize("config", [RvqVaeConfig, PartVqVaeConfig])
+def test_unknown_ends_are_refused(config):
+    with pytest.raises(
+        ValueError, match=r"`decoder_ends` must be one of \('zeros', 'repeat'\), got 'mirror'"
+    ):
+        config(decoder_ends="mirror")

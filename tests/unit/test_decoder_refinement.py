@@ -48,6 +48,11 @@ def test_a_body_that_jitters_has_the_velocity_of_its_jitter(recipe):
     assert losses["velocity"] == pytest.approx(0.01 * 20, abs=1e-4)  # 1 cm between any two frames
 
 
+def test_a_pop_in_the_last_frame_counts_as_acceleration(recipe):
+    losses = _losses(recipe, lambda joints: joints[:, 7, :, 1].add_(0.02))
+    assert losses["acceleration"] == pytest.approx(0.02 * 20**2 / 6, rel=1e-4)  # one of six differences
+
+
 def test_a_body_of_twice_the_size_has_bones_that_are_too_long(recipe):
     torch.manual_seed(1)
     wanted = torch.randn(1, _FRAMES, 22, 3)

@@ -16,7 +16,7 @@ from controlmm.generation.sensitivity import measure_sensitivity
 from controlmm.generation.solvers import Stopping, gauss_newton
 from controlmm.generation.solvers.metric import Groups, Metric
 from controlmm.models.rvq_vae import frame_mask
-from controlmm.nn.conv import ConvDecoder
+from controlmm.nn.conv import ConvDecoder, DecoderEnds
 from controlmm.ops import masked_consistency_loss, recover_joints
 
 ROUNDING = 1e-5  # of float32 sums in another order
@@ -27,10 +27,10 @@ def random(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
-def make_decoder(*, depth: int = 2, is_always_on: bool = False) -> ConvDecoder:
+def make_decoder(*, depth: int = 2, is_always_on: bool = False, ends: DecoderEnds = "zeros") -> ConvDecoder:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(3)
-        decoder = ConvDecoder(8, 12, width=8, depth=depth, downsample=4, dropout=0.0)
+        decoder = ConvDecoder(8, 12, width=8, depth=depth, downsample=4, dropout=0.0, ends=ends)
     if is_always_on:  # biases so large that every rectifier stays on: the decoder is linear
         for name, parameter in decoder.named_parameters():
             if name.endswith("bias"):
@@ -40,9 +40,10 @@ def make_decoder(*, depth: int = 2, is_always_on: bool = False) -> ConvDecoder:
     return decoder.eval().requires_grad_(False)
 
 
+@pytest.mark.parametrize("ends", ["zeros", "repeat"])
 @pytest.mark.parametrize("tokens", [1, 2, 5, 13])
-def test_frozen_decoder_agrees_with_autograd(tokens):
-    decoder, latents = make_decoder(), random(3, tokens, 8)
+def test_frozen_decoder_agrees_with_autograd(tokens, ends):
+    decoder, latents = make_decoder(ends=ends), random(3, tokens, 8)
     frozen = FrozenDecoder(decoder)
     features, tape = frozen.forward(latents, CHANNELS)
     leaf = latents.clone().requires_grad_()
@@ -53,8 +54,10 @@ def test_frozen_decoder_agrees_with_autograd(tokens):
     torch.testing.assert_close(frozen.pull(tape, cotangent), gradient, rtol=1e-4, atol=ROUNDING)
 
 
-def test_tangents_of_the_frozen_decoder_are_finite_differences():
-    decoder, latents, tangent = make_decoder().double(), random(2, 6, 8).double(), random(2, 6, 8, seed=4)
+@pytest.mark.parametrize("ends", ["zeros", "repeat"])
+def test_tangents_of_the_frozen_decoder_are_finite_differences(ends):
+    decoder = make_decoder(ends=ends).double()
+    latents, tangent = random(2, 6, 8).double(), random(2, 6, 8, seed=4)
     frozen, step = FrozenDecoder(decoder, dtype=torch.float64), 1e-6
     _, tape = frozen.forward(latents, CHANNELS)
     shifted = [frozen.forward(latents + sign * step * tangent, CHANNELS)[0] for sign in (1, -1)]
@@ -62,8 +65,9 @@ def test_tangents_of_the_frozen_decoder_are_finite_differences():
     torch.testing.assert_close(frozen.push(tape, tangent.double()), difference, rtol=1e-6, atol=1e-6)
 
 
-def test_tangents_and_gradients_are_adjoint():
-    decoder, latents = make_decoder(), random(2, 6, 8)
+@pytest.mark.parametrize("ends", ["zeros", "repeat"])
+def test_tangents_and_gradients_are_adjoint(ends):
+    decoder, latents = make_decoder(ends=ends), random(2, 6, 8)
     frozen = FrozenDecoder(decoder)
     features, tape = frozen.forward(latents, CHANNELS)
     tangent, cotangent = random(2, 6, 8, seed=1), random(*features.shape, seed=2)

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from controlmm.generation.frozen_layers import FrozenConv, Lengths
+from controlmm.generation.repeated_ends import RepeatedEnds, repeated_ends
 from controlmm.nn.conv import ConvDecoder, ResidualConvBlock, ResidualStack
 
 
@@ -50,6 +51,7 @@ class FrozenDecoder:
 
     def __init__(self, decoder: ConvDecoder, *, dtype: torch.dtype = torch.float32) -> None:
         self._dtype = dtype
+        self._repeats_ends, self._step = decoder.ends == "repeat", decoder.downsample
         self._entry = FrozenConv.of(decoder.entry, dtype)
         self._stacks = [
             [_Block(cast(ResidualConvBlock, block), dtype) for block in cast(ResidualStack, stack)]
@@ -67,8 +69,9 @@ class FrozenDecoder:
 
         Each row is a clip, or there is one row of clips of ``lengths`` tokens.
         """
+        seen, lengths = self._with_ends(latents.to(self._dtype), lengths)
         tape_lengths = lengths
-        x = entry = self._entry.forward(latents.to(self._dtype), lengths, is_rectified=True)
+        x = entry = self._entry.forward(seen, lengths, is_rectified=True)
         saved = []
         for stack, up in zip(self._stacks, self._ups, strict=True):
             for block in stack:
@@ -79,7 +82,8 @@ class FrozenDecoder:
             x = up.forward(_doubled(x), lengths)
         smooth = self._smooth.forward(x, lengths, is_rectified=True)
         tape = Tape(tuple(channels), tape_lengths, entry, tuple(saved), smooth)
-        return self._exit_for(tape.channels).forward(smooth, lengths).to(latents.dtype), tape
+        features = self._exit_for(tape.channels).forward(smooth, lengths)
+        return self._own_frames(features, tape).to(latents.dtype), tape
 
     def pull(self, tape: Tape, gradient: Float[Tensor, "B T D"]) -> Float[Tensor, "B L C"]:
         """Gradient in the latents, given that in the features: the transposed Jacobian times a vector."""
@@ -87,7 +91,8 @@ class FrozenDecoder:
         for _ in self._stacks:
             scales.append(_twice(scales[-1]))
         lengths = scales.pop()
-        gradient = self._exit_for(tape.channels).backward(gradient.to(self._dtype), lengths)
+        gradient = self._with_frames_beyond(gradient.to(self._dtype), tape)
+        gradient = self._exit_for(tape.channels).backward(gradient, lengths)
         gradient = self._smooth.backward(_switched(gradient, tape.smooth), lengths)
         saved = list(tape.blocks)
         for stack, up in zip(reversed(self._stacks), reversed(self._ups), strict=True):
@@ -97,13 +102,14 @@ class FrozenDecoder:
                 x, hidden = saved.pop()
                 inner = _switched(block.pointwise.backward(gradient), hidden)
                 gradient = gradient + _switched(block.dilated.backward(inner, lengths), x)
-        return self._entry.backward(_switched(gradient, tape.entry), lengths).to(dtype)
+        gradient = self._entry.backward(_switched(gradient, tape.entry), lengths).to(dtype)
+        return self._ends(tape).pulled(gradient) if self._repeats_ends else gradient
 
     def push(self, tape: Tape, tangent: Float[Tensor, "B L C"]) -> Float[Tensor, "B T D"]:
         """Change of the features for a small change of the latents: the Jacobian times a vector."""
         lengths = tape.lengths
-        x = self._entry.forward(tangent.to(self._dtype), lengths, is_tangent=True)
-        x = _switched(x, tape.entry)
+        seen = self._ends(tape).added(tangent) if self._repeats_ends else tangent
+        x = _switched(self._entry.forward(seen.to(self._dtype), lengths, is_tangent=True), tape.entry)
         saved = iter(tape.blocks)
         for stack, up in zip(self._stacks, self._ups, strict=True):
             for block in stack:
@@ -113,7 +119,30 @@ class FrozenDecoder:
             lengths = _twice(lengths)
             x = up.forward(_doubled(x), lengths, is_tangent=True)
         x = _switched(self._smooth.forward(x, lengths, is_tangent=True), tape.smooth)
-        return self._exit_for(tape.channels).forward(x, lengths, is_tangent=True).to(tangent.dtype)
+        x = self._exit_for(tape.channels).forward(x, lengths, is_tangent=True)
+        return self._own_frames(x, tape).to(tangent.dtype)
+
+    def _with_ends(self, latents: Tensor, lengths: Lengths) -> tuple[Tensor, Lengths]:
+        """What the convolutions see."""
+        if not self._repeats_ends:
+            return latents, lengths
+        longer = repeated_ends(lengths or (latents.shape[1],)).added(latents)
+        return longer, tuple(length + 2 for length in lengths)
+
+    def _ends(self, tape: Tape) -> RepeatedEnds:
+        return repeated_ends(tuple(length - 2 for length in tape.lengths or (tape.entry.shape[1],)))
+
+    def _own_frames(self, features: Tensor, tape: Tape) -> Tensor:
+        return features[:, self._ends(tape).frames(self._step)] if self._repeats_ends else features
+
+    def _with_frames_beyond(self, gradient: Tensor, tape: Tape) -> Tensor:
+        """The transpose of :meth:`_own_frames`."""
+        if not self._repeats_ends:
+            return gradient
+        frames = tape.entry.shape[1] * self._step
+        longer = gradient.new_zeros(len(gradient), frames, gradient.shape[2])
+        longer[:, self._ends(tape).frames(self._step)] = gradient
+        return longer
 
     def _exit_for(self, channels: tuple[int, ...]) -> FrozenConv:
         if channels not in self._exits:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from controlmm.models.tokenizer import MotionTokenizer
 from controlmm.motion.body_parts import body_parts
 from controlmm.motion.skeleton import skeleton_of_width
-from controlmm.nn.conv import ConvDecoder, ConvEncoder
+from controlmm.nn.conv import ConvDecoder, ConvEncoder, DecoderEnds, check_ends
 from controlmm.nn.part_quantizer import PartQuantizer
 
 _PUBLISHED_TOKENS = 49  # of the published training, which pads every clip to 196 frames
@@ -36,6 +36,7 @@ class PartVqVaeConfig:
     # clip, so codes depend on the padded length; such a model only works at the length it was trained at.
     latent_norm: Literal["step", "clip"] = "step"
     is_split: bool = True  # False: the paper's ablation, one encoder and codebook for the whole body
+    decoder_ends: DecoderEnds = "zeros"  # published; what the decoder sees beyond a clip, see `ConvDecoder`
 
     def __post_init__(self) -> None:
         if self.downsample < 2 or self.downsample & (self.downsample - 1):
@@ -44,6 +45,7 @@ class PartVqVaeConfig:
             raise ValueError(f"Sizes must be positive, got {self}.")
         if self.latent_norm not in ("step", "clip"):
             raise ValueError(f"`latent_norm` must be 'step' or 'clip', got {self.latent_norm!r}.")
+        check_ends(self.decoder_ends)
 
     @classmethod
     def paper(cls) -> PartVqVaeConfig:
@@ -53,7 +55,7 @@ class PartVqVaeConfig:
     @classmethod
     def small(cls) -> PartVqVaeConfig:
         """The size that ships: 3.7 M parameters, 1.6 M of them in the decoder."""
-        return cls(codebook_size=256, code_dim=64, width=192, encoder_width=96)
+        return cls(codebook_size=256, code_dim=64, width=192, encoder_width=96, decoder_ends="repeat")
 
     @classmethod
     def tiny(cls) -> PartVqVaeConfig:
@@ -108,7 +110,12 @@ class PartVqVae(MotionTokenizer):
             for channels in self._channels
         )
         self.decoder = ConvDecoder(
-            config.latent_dim, config.feature_dim, width=config.width, dropout=0.0, **sizes
+            config.latent_dim,
+            config.feature_dim,
+            width=config.width,
+            dropout=0.0,
+            ends=config.decoder_ends,
+            **sizes,
         )
         self.quantizer = PartQuantizer(
             parts=config.num_parts,

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from controlmm.models.tokenizer import MotionTokenizer
-from controlmm.nn.conv import ConvDecoder, ConvEncoder
+from controlmm.nn.conv import ConvDecoder, ConvEncoder, DecoderEnds, check_ends
 from controlmm.nn.quantizer import ResidualQuantizer
 
 
@@ -33,6 +33,7 @@ class RvqVaeConfig:
     takes_first_rows: bool = (
         False  # fresh and dead codes: first vectors of the batch (published), or random ones
     )
+    decoder_ends: DecoderEnds = "zeros"  # published; what the decoder sees beyond a clip, see `ConvDecoder`
 
     def __post_init__(self) -> None:
         if self.downsample < 2 or self.downsample & (self.downsample - 1):
@@ -41,6 +42,7 @@ class RvqVaeConfig:
             raise ValueError(f"Sizes must be positive, got {self}.")
         if not 0 <= self.quantize_dropout <= 1 or not 0 <= self.dropout < 1:
             raise ValueError(f"`quantize_dropout` must be in [0, 1] and `dropout` in [0, 1), got {self}.")
+        check_ends(self.decoder_ends)
 
     @classmethod
     def paper(cls) -> RvqVaeConfig:
@@ -50,7 +52,7 @@ class RvqVaeConfig:
     @classmethod
     def small(cls) -> RvqVaeConfig:
         """The size that ships: 2.9 M parameters."""
-        return cls(code_dim=192, width=192, dropout=0.0)
+        return cls(code_dim=192, width=192, dropout=0.0, decoder_ends="repeat")
 
     @classmethod
     def tiny(cls) -> RvqVaeConfig:
@@ -74,7 +76,9 @@ class RvqVae(MotionTokenizer):
         super().__init__(config)
         sizes = {"width": config.width, "depth": config.depth, "downsample": config.downsample}
         self.encoder = ConvEncoder(config.feature_dim, config.code_dim, dropout=config.dropout, **sizes)
-        self.decoder = ConvDecoder(config.code_dim, config.feature_dim, dropout=config.dropout, **sizes)
+        self.decoder = ConvDecoder(
+            config.code_dim, config.feature_dim, dropout=config.dropout, ends=config.decoder_ends, **sizes
+        )
         self.quantizer = ResidualQuantizer(
             num_quantizers=config.num_quantizers,
             num_codes=config.codebook_size,

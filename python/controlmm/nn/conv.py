@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 _DILATION_GROWTH = 3
+
+DecoderEnds = Literal["zeros", "repeat"]
+
+
+def check_ends(ends: str) -> None:
+    """Raise ``ValueError`` unless ``ends`` is one of :data:`DecoderEnds`."""
+    if ends not in get_args(DecoderEnds):
+        raise ValueError(f"`decoder_ends` must be one of {get_args(DecoderEnds)}, got {ends!r}.")
 
 
 class ResidualConvBlock(nn.Module):
@@ -69,12 +78,25 @@ class ConvEncoder(nn.Module):
 
 
 class ConvDecoder(nn.Module):
-    """Tokens to frames, the mirror image of :class:`ConvEncoder` with nearest-neighbour up-sampling."""
+    """Tokens to frames, the mirror image of :class:`ConvEncoder` with nearest-neighbour up-sampling.
+
+    ``ends`` says what is seen beyond a clip: "zeros" (published), or its first and last token once more
+    ("repeat"), whose frames are then cut off. With zeros the first and the last frame of a motion pop.
+    """
 
     def __init__(
-        self, in_dim: int, out_dim: int, *, width: int, depth: int, downsample: int, dropout: float
+        self,
+        in_dim: int,
+        out_dim: int,
+        *,
+        width: int,
+        depth: int,
+        downsample: int,
+        dropout: float,
+        ends: DecoderEnds = "zeros",
     ) -> None:
         super().__init__()
+        self.downsample, self.ends = downsample, ends
         stages = downsample.bit_length() - 1
         self.entry = nn.Conv1d(in_dim, width, 3, padding=1)
         self.stacks = nn.ModuleList(ResidualStack(width, depth=depth, dropout=dropout) for _ in range(stages))
@@ -86,6 +108,19 @@ class ConvDecoder(nn.Module):
         self, x: Float[Tensor, "B C L"], valid: Bool[Tensor, "B T"] | None = None
     ) -> Float[Tensor, "B D T"]:
         """Channel-major frames, as the last convolution emits them and the fused kernels read them."""
+        if self.ends == "zeros":
+            return self._frames(x, valid)
+        step = self.downsample
+        if valid is None:
+            return self._frames(torch.cat([x[..., :1], x, x[..., -1:]], dim=-1), None)[..., step:-step]
+        tokens = valid[:, ::step].sum(1)
+        index = torch.arange(-1, x.shape[-1] + 1, device=x.device).clamp(min=0)
+        index = torch.minimum(index, (tokens - 1).clamp(min=0)[:, None])
+        longer = torch.cat([valid.new_ones(len(valid), 2 * step), valid], dim=1)
+        decoded = self._frames(x.gather(-1, index[:, None].expand(-1, x.shape[1], -1)), longer)
+        return masked(decoded[..., step:-step], valid[:, None].to(x.dtype))
+
+    def _frames(self, x: Float[Tensor, "B C L"], valid: Bool[Tensor, "B T"] | None) -> Float[Tensor, "B D T"]:
         masks = _mask_pyramid(valid, levels=len(self.up), dtype=x.dtype)[::-1]
         x = masked(torch.relu(self.entry(masked(x, masks[0]))), masks[0])
         for stack, up, (coarse, fine) in zip(self.stacks, self.up, pairwise(masks), strict=True):

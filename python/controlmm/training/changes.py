@@ -33,10 +33,11 @@ def _fields(part: Any) -> dict[str, Any]:
 
 
 def _parse(name: str, text: str, kind: Any) -> Any:
-    if isinstance(kind, types.UnionType):
-        if text == "none" and types.NoneType in kind.__args__:
+    if typing.get_origin(kind) in (types.UnionType, typing.Union):  # the latter: of a Literal and None
+        kinds = typing.get_args(kind)
+        if text == "none" and types.NoneType in kinds:
             return None
-        (kind,) = (part for part in kind.__args__ if part is not types.NoneType)
+        (kind,) = (part for part in kinds if part is not types.NoneType)
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is tuple:
         return tuple(_parse(name, item, arguments[0]) for item in text.split(",") if item)

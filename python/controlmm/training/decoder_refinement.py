@@ -23,6 +23,7 @@ from controlmm.models.rvq_vae import frame_mask
 from controlmm.models.tokenizer import MotionTokenizer
 from controlmm.motion.layout import feature_layout
 from controlmm.motion.normalizer import Normalizer
+from controlmm.nn.conv import DecoderEnds, check_ends
 from controlmm.ops import recover_joints
 from controlmm.training.rvq import POSITION_WEIGHT, reconstruction_errors
 from controlmm.training.settings import TrainingSettings
@@ -56,18 +57,22 @@ _LONGEST = 49  # tokens
 
 @dataclass(frozen=True)
 class DecoderOptions:
-    """Weights of what is measured on the recovered joints, beside the reconstruction of the features."""
+    """Weights of what is measured on the recovered joints, beside the reconstruction; and other ends."""
 
     joint_weight: float = 1.0  # distance from the recorded joints, in metres
     # Distance of the velocities, in metres a second. Positions alone let a decoder jitter around the right
     # place: jerk of rebuilt clips was twice that of recordings.
     velocity_weight: float = 0.2
     bone_weight: float = 1.0  # difference of the bones' lengths, in metres; features do not keep them
+    acceleration_weight: float = 0.0  # distance of the accelerations, in metres a second squared
+    ends: DecoderEnds | None = None  # what the decoder sees beyond a clip; None: as it was trained
 
     def __post_init__(self) -> None:
-        for option in dataclasses.fields(self):
-            if not getattr(self, option.name) >= 0:
-                raise ValueError(f"`{option.name}` must not be negative, got {getattr(self, option.name)}.")
+        for name in ("joint_weight", "velocity_weight", "bone_weight", "acceleration_weight"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"`{name}` must not be negative, got {getattr(self, name)}.")
+        if self.ends is not None:
+            check_ends(self.ends)
 
 
 class DecoderRecipe:
@@ -130,16 +135,18 @@ class DecoderRecipe:
     def _joint_losses(
         self, shown: Float[Tensor, "B T J 3"], wanted: Float[Tensor, "B T J 3"], frames: Bool[Tensor, "B T"]
     ) -> dict[str, Tensor]:
-        """Mean distances of joints (m), their velocities (m/s) and bone lengths (m)."""
+        """Mean distances of joints (m), velocities (m/s), bone lengths (m) and accelerations (m/s^2)."""
         skeleton = self.normalizer.skeleton
         steps = frames[:, 1:] & frames[:, :-1]
         parents = torch.tensor(skeleton.parents[1:], device=shown.device)
         bones = [(joints[..., 1:, :] - joints[..., parents, :]).norm(dim=-1) for joints in (shown, wanted)]
-        velocity = (shown - wanted).diff(dim=1).norm(dim=-1)[steps].mean() * skeleton.fps
+        off = (shown - wanted) * skeleton.metres
+        velocity, acceleration = (off.diff(n=order, dim=1) * skeleton.fps**order for order in (1, 2))
         return {
-            "joint": (shown - wanted).norm(dim=-1)[frames].mean() * skeleton.metres,
-            "velocity": velocity * skeleton.metres,
+            "joint": off.norm(dim=-1)[frames].mean(),
+            "velocity": velocity.norm(dim=-1)[steps].mean(),
             "bone": (bones[0] - bones[1]).abs()[frames].mean() * skeleton.metres,
+            "acceleration": acceleration.norm(dim=-1)[steps[:, 1:]].mean(),
         }
 
     def _sample(self, count: int) -> tuple[Int[Tensor, "B L Q"], Float[Tensor, "B T D"], Bool[Tensor, "B T"]]:
@@ -171,17 +178,26 @@ _Tokenizer = TypeVar("_Tokenizer", bound=MotionTokenizer)
 def tokenizer_to_refine(network: type[_Tokenizer], stage: str, inputs: StageInputs) -> _Tokenizer:
     """The trained tokenizer of ``stage``, or the weights to start from if they have its codes.
 
+    With the ends that the options name.
+
     Raises:
         FileNotFoundError: If the stage is not trained yet.
         ValueError: If the weights to start from have other codes.
     """
-    trained = network.from_pretrained(best_weights(inputs.root, stage))
-    if inputs.start is None:
-        return trained
-    given = network.from_pretrained(inputs.start)
-    if not have_same_codes(given, trained):
-        raise ValueError(
-            f"{inputs.start} has other codes than {inputs.root / stage}; a decoder can only be refined "
-            "for the codes that tokens are made with. Choose another --out."
-        )
-    return given
+    model = network.from_pretrained(best_weights(inputs.root, stage))
+    if inputs.start is not None:
+        given = network.from_pretrained(inputs.start)
+        if not have_same_codes(given, model):
+            raise ValueError(
+                f"{inputs.start} has other codes than {inputs.root / stage}; a decoder can only be refined "
+                "for the codes that tokens are made with. Choose another --out."
+            )
+        model = given
+    ends = inputs.options.ends
+    return model if ends is None else _with_ends(model, ends)
+
+
+def _with_ends(model: _Tokenizer, ends: DecoderEnds) -> _Tokenizer:
+    changed = type(model)(dataclasses.replace(model.config, decoder_ends=ends))
+    changed.load_state_dict(model.state_dict())
+    return changed.eval()
