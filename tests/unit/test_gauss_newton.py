@@ -102,8 +102,9 @@ def test_neighbours_of_clips_that_lie_end_to_end():
         assert torch.equal(neighbours(torch.cat(clips, 1), distance, (2, 7, 1, 4)), torch.cat(expected, 1))
 
 
-def test_clips_that_lie_end_to_end_are_decoded_as_each_by_itself():
-    frozen, lengths = FrozenDecoder(make_decoder()), (5, 1, 13, 2)
+@pytest.mark.parametrize("ends", ["zeros", "repeat"])
+def test_clips_that_lie_end_to_end_are_decoded_as_each_by_itself(ends):
+    frozen, lengths = FrozenDecoder(make_decoder(ends=ends)), (5, 1, 13, 2)
     clips = [random(1, tokens, 8, seed=tokens) for tokens in lengths]
     seeds = [random(1, 4 * tokens, len(CHANNELS), seed=tokens) for tokens in lengths]
     features, tape = frozen.forward(torch.cat(clips, 1), CHANNELS, lengths)
