@@ -154,7 +154,9 @@ def test_the_gradients_of_gauss_newton_and_of_objectives_are_autograds(scene):
         (expected,) = torch.autograd.grad(strain.sum(), leaf)
     residuals = ControlResiduals(decoder, targets, mask, frames, naturalness=natural)
     probes = residuals.probe(moved)
-    torch.testing.assert_close(torch.tensor([probe.strain for probe in probes]), strain.detach())
+    # Third differences of features that two libraries round differently, each to about 1e-7 of itself.
+    strains = torch.tensor([probe.strain for probe in probes])
+    torch.testing.assert_close(strains, strain.detach(), rtol=ROUNDING, atol=0)
     no_weights = [torch.zeros_like(probe.residual) for probe in probes]
     size = expected.abs().amax((1, 2)).tolist()
     pulled = residuals.pull(no_weights, strained=[True, False])
