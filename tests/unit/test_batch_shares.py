@@ -13,6 +13,7 @@ import torch
 from controlmm import JointControl
 from controlmm.controls import Objective, Sphere, TimelineEntry
 from controlmm.generation.noise import clip_seeds
+from controlmm.generation.shares import in_shares
 from controlmm.pipelines import PRESETS, Preset
 from controlmm.pipelines.clip_batch import ClipBatch
 
@@ -121,6 +122,24 @@ def test_tracks_of_a_timeline_are_the_same_by_any_number_of_threads(tiny_pipelin
     one = by_threads(1, call)
     assert_equal(one, by_threads(2, call))
     assert sorted(share_sizes[1:]) == [2, 2]
+
+
+@pytest.mark.parametrize("options", [{"keep": [(0.0, 0.6)]}, {"keep_parts": ["lower"], "exact": True}, {}])
+def test_edits_are_the_same_by_any_number_of_threads(tiny_pipeline, monkeypatch, options):
+    threads = []
+
+    def noted(*args: Any, **kwargs: Any) -> torch.Tensor:
+        threads.append(kwargs["threads"])
+        return in_shares(*args, **kwargs)
+
+    monkeypatch.setattr("controlmm.pipelines.motion_editing.in_shares", noted)
+    source = tiny_pipeline(PROMPT, frames=24, preset=PLANS["fast"]).best
+
+    def call():
+        return tiny_pipeline.edit(source, "a person sits", samples=3, preset=PLANS["fast"], **options)
+
+    assert_equal(by_threads(1, call), by_threads(2, call))
+    assert threads == [1, 2]
 
 
 def test_what_is_for_the_whole_batch_is_not_split(tiny_pipeline, share_sizes):

@@ -145,7 +145,7 @@ class FrozenDecoder:
         return longer
 
     def _exit_for(self, channels: tuple[int, ...]) -> FrozenConv:
-        if channels not in self._exits:
+        if channels not in self._exits:  # shares of a batch may each make one; it is stored when it is whole
             wanted, bias = list(channels), self._exit.bias
             assert bias is not None
             self._exits[channels] = FrozenConv(self._exit.weight[wanted], bias[wanted], 1, self._dtype)

@@ -14,10 +14,11 @@ from controlmm.generation.decoding_request import DecodingRequest
 from controlmm.generation.latent_editing import edit_latents
 from controlmm.generation.noise import ClipNoise
 from controlmm.generation.objective import ControlObjective
+from controlmm.generation.one_thread import allowed_threads
 from controlmm.generation.planted_feet import with_planted_feet
 from controlmm.generation.solvers import Progress
 from controlmm.generation.stepping import with_steps
-from controlmm.generation.terms import JointTerm
+from controlmm.generation.terms import JointTerm, is_callers
 from controlmm.models.control_branch import ControlBranch
 from controlmm.pipelines.presets import Preset
 from controlmm.pipelines.token_drawing import drawn_latents, latents_from_text
@@ -134,3 +135,9 @@ def _edited(
     drawn = with_steps(objective, drawn, clips.valid, preset.budget, progress=progress)
     keep = clips.valid[..., None].float()
     return edit_latents(objective, drawn, keep, preset.budget, progress=progress).latents
+
+
+def share_count(preset: Preset, terms: Sequence[JointTerm]) -> int:
+    """Into how many shares a batch may go. A time budget and a caller's function are for all of it."""
+    is_whole = preset.budget.time_budget is not None or any(is_callers(term) for term in terms)
+    return 1 if is_whole else allowed_threads()

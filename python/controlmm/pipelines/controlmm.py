@@ -18,11 +18,11 @@ from controlmm.generation.frozen_layers import has_fast_bfloat16
 from controlmm.generation.latent_editing import edit_latents
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.objective import ControlObjective
-from controlmm.generation.one_thread import allowed_threads, one_thread
+from controlmm.generation.one_thread import one_thread
 from controlmm.generation.packed_networks import PackedCopies
 from controlmm.generation.shares import in_shares
 from controlmm.generation.solvers import Progress
-from controlmm.generation.terms import JointTerm, is_callers
+from controlmm.generation.terms import JointTerm
 from controlmm.models.control_branch import ControlBranch
 from controlmm.models.length_estimator import LengthEstimator
 from controlmm.models.masked_transformer import MaskedTransformer
@@ -34,7 +34,7 @@ from controlmm.motion.normalizer import Normalizer
 from controlmm.nn.checkpoint import PretrainedModel
 from controlmm.pipelines.adjusting import adjusted
 from controlmm.pipelines.checks import check_masks_end, check_sizes
-from controlmm.pipelines.clip_batch import ClipBatch
+from controlmm.pipelines.clip_batch import ClipBatch, share_count
 from controlmm.pipelines.guidance import PUBLISHED, Guidance
 from controlmm.pipelines.motion_editing import run_edit
 from controlmm.pipelines.output import GenerationResult
@@ -263,7 +263,7 @@ class ControlMM(MotionPipeline[Preset]):
         return in_shares(
             lambda rows, report: batch.select(rows).latents(self, preset, report),
             batch.costs,
-            threads=_threads(preset, terms),
+            threads=share_count(preset, terms),
             progress=progress,
         )
 
@@ -303,13 +303,7 @@ class ControlMM(MotionPipeline[Preset]):
             return edit_latents(objective, latents[rows], keep[rows], preset.budget, progress=report).latents
 
         costs = valid.sum(1).tolist()
-        return in_shares(refine, costs, threads=_threads(preset, terms), progress=progress)
-
-
-def _threads(preset: Preset, terms: Sequence[JointTerm]) -> int:
-    """Into how many shares a batch may go. A time budget and a caller's function are for all of it."""
-    is_whole = preset.budget.time_budget is not None or any(is_callers(term) for term in terms)
-    return 1 if is_whole else allowed_threads()
+        return in_shares(refine, costs, threads=share_count(preset, terms), progress=progress)
 
 
 def _padded(dense: Tensor, frames: int) -> Tensor:

@@ -18,12 +18,14 @@ from controlmm.generation.latent_editing import edit_latents
 from controlmm.generation.masked_decoding import fill_residual_layers
 from controlmm.generation.noise import ClipNoise, clip_seeds
 from controlmm.generation.objective import ControlObjective, control_error
+from controlmm.generation.shares import in_shares
 from controlmm.generation.solvers import Progress
 from controlmm.generation.terms import JointTerm
 from controlmm.generation.variation import vary_tokens
 from controlmm.motion.motion import Motion
 from controlmm.ops import recover_joints
 from controlmm.pipelines.checks import check_sampling
+from controlmm.pipelines.clip_batch import share_count
 from controlmm.pipelines.edit_scene import EditScene, held_term
 from controlmm.pipelines.output import GenerationResult
 from controlmm.pipelines.pipeline import MAX_FRAMES
@@ -71,28 +73,55 @@ def run_edit(
         raise ValueError("`exact=False` is about `keep`, and nothing is kept by it. Leave one out.")
     frames = scene.source.num_frames
     padded = pipeline.padded_frames(frames)
-    ids = _tokens(pipeline, scene, padded).expand(samples, -1, -1)
-    text = pipeline.text_encoder.encode([scene.prompt]).pooled.expand(samples, -1)
-    request = DecodingRequest(
-        text,
-        torch.ones(ids.shape[:2], dtype=torch.bool),
-        ClipNoise(clip_seeds(seed, samples)),
-        steps=preset.steps,
-        guidance_scale=pipeline.guidance.under(preset).base,
-        rules=preset.rules,
+    ids = _tokens(pipeline, scene, padded)
+    text = pipeline.text_encoder.encode([scene.prompt]).pooled
+    seeds = clip_seeds(seed, samples)
+
+    def edited(rows: Tensor, report: Progress | None) -> Tensor:
+        count = len(rows)
+        own_ids = ids.expand(count, -1, -1)
+        request = DecodingRequest(
+            text.expand(count, -1),
+            torch.ones(own_ids.shape[:2], dtype=torch.bool),
+            ClipNoise([seeds[row] for row in rows.tolist()]),
+            steps=preset.steps,
+            guidance_scale=pipeline.guidance.under(preset).base,
+            rules=preset.rules,
+            progress=report,
+            kept=_kept_tokens(pipeline, scene, own_ids),
+            dtype=pipeline.drawing_dtype(preset),
+        )
+        return _edited(pipeline, scene, request, own_ids, preset, exact=exact)
+
+    latents = in_shares(
+        edited,
+        [1.0] * samples,
+        threads=share_count(preset, scene.terms(samples, padded)),
         progress=progress,
-        kept=_kept_tokens(pipeline, scene, ids),
-        dtype=pipeline.drawing_dtype(preset),
     )
-    terms = scene.terms(samples, padded)
-    latents = _drawn(pipeline, scene, request, ids, terms, preset)
-    objective = _final(pipeline, scene, terms, samples, preset, exact=exact)
-    if objective.mask.any() or objective.terms:
-        may_change = request.valid if exact else request.drawn
-        may_change = may_change[..., None].float()
-        latents = edit_latents(objective, latents, may_change, preset.budget, progress=progress).latents
     features = pipeline.decoder.clip_features(latents)[:, :frames]
     return edit_result(scene, features, latents, started)
+
+
+def _edited(
+    pipeline: ControlMM,
+    scene: EditScene,
+    request: DecodingRequest,
+    ids: Int[Tensor, "B L Q"],
+    preset: Preset,
+    *,
+    exact: bool,
+) -> Float[Tensor, "B L C"]:
+    """Latents of some of the samples."""
+    samples = len(ids)
+    terms = scene.terms(samples, ids.shape[1] * pipeline.decoder.downsample)
+    latents = _drawn(pipeline, scene, request, ids, terms, preset)
+    objective = _final(pipeline, scene, terms, samples, preset, exact=exact)
+    if not (objective.mask.any() or objective.terms):
+        return latents
+    may_change = (request.valid if exact else request.drawn)[..., None].float()
+    progress = request.progress
+    return edit_latents(objective, latents, may_change, preset.budget, progress=progress).latents
 
 
 def _tokens(pipeline: ControlMM, scene: EditScene, padded: int) -> Int[Tensor, "1 L Q"]:

@@ -38,8 +38,9 @@ _Plan = TypeVar("_Plan")  # a pipeline's kind of preset
 class MotionPipeline(PretrainedPipeline, ABC, Generic[_Plan]):
     """Text plus 3D control in, motions out. A subclass says how the latents of a batch are made.
 
-    Calls take one thread. Operators on a few clips are so small that two save a tenth of the time, and where
-    another program keeps a core busy they wait for each other twenty times as long.
+    One clip takes one thread: operators are so small that two would save a tenth of the time, and wait for
+    each other twenty times as long where another program keeps a core busy. A batch is dealt out to as many
+    threads as torch may use, with the same results; ``torch.set_num_threads(1)`` forbids it.
     """
 
     length: LengthEstimator | None = None  # draws the length of motions whose caller does not say
@@ -135,7 +136,7 @@ class MotionPipeline(PretrainedPipeline, ABC, Generic[_Plan]):
                 presets do (the papers' do not). Feet at rest stay, joints do not shake, and the ground stays
                 level where heights are free; 0 if a path climbs stairs. Without targets only feet count.
             seed: Same seed, same motions.
-            progress: Called as ``progress(phase, done, total)`` during long loops.
+            progress: Called as ``progress(phase, done, total)`` during long loops, from the caller's thread.
 
         Raises:
             TypeError: If an argument has the wrong type; nothing has run then.
