@@ -70,7 +70,7 @@ def draw_top_view(axes: Axes, scene: Scene) -> None:
     axes.spines[:].set_color(palette.GRID)
     axes.set_xlabel("← left    x (m)", fontsize=9, color=palette.PATH)
     axes.set_ylabel("z (m)    front →", fontsize=9, color=palette.PATH)
-    axes.set_title("from above   ○ start   ■ end", fontsize=11, color=palette.PATH, loc="left")
+    axes.set_title("from above   ○ start   ■ end   - facing", fontsize=11, color=palette.PATH, loc="left")
 
 
 def _draw_controls(

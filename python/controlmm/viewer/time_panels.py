@@ -10,6 +10,9 @@ from controlmm.viewer.obstacles import clearance_over_time
 from controlmm.viewer.scene import Scene
 from controlmm.viewer.target_style import is_dense, target_color, target_marker, traced_joints
 
+_LEGEND_COLUMNS = 3
+_LEGEND_ROW = 0.14  # of the height of the curves
+
 
 def draw_heights(axes: Axes, scene: Scene, *, has_time_label: bool) -> None:
     """Draw the height of pelvis, feet and controlled joints in metres, with the heights asked for."""
@@ -77,4 +80,10 @@ def _finish(axes: Axes, scene: Scene, *, title: str, has_time_label: bool) -> No
     axes.set_title(title, fontsize=11, color=palette.PATH, loc="left")
     if has_time_label:
         axes.set_xlabel("time (s)", fontsize=9, color=palette.PATH)
-    axes.legend(fontsize=8, frameon=False, ncols=3, loc="best", labelcolor=palette.INK, handlelength=1.2)
+    names = len(axes.get_legend_handles_labels()[1])
+    low, high = axes.get_ylim()  # room for the names above the curves, which fill the rest of the panel
+    axes.set_ylim(low, high + _LEGEND_ROW * -(-names // _LEGEND_COLUMNS) * (high - low))
+    axes.legend(
+        fontsize=8, frameon=False, ncols=_LEGEND_COLUMNS, loc="upper right", borderaxespad=0.2,
+        labelcolor=palette.INK, handlelength=1.2,
+    )  # fmt: skip
