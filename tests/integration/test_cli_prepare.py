@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -47,13 +48,38 @@ def test_joints_become_a_folder_with_mirrored_clips_and_splits(
     command: Command, joint_folder: Path, tmp_path: Path
 ) -> None:
     printed = command("prepare", "--joints", joint_folder, "--out", tmp_path / "data", "--quiet")
-    assert printed == f"{tmp_path / 'data'}: 16 clips, mirrored ones included\n"
+    assert printed.splitlines() == [
+        f"{tmp_path / 'data'}: 16 clips, mirrored ones included",
+        "recorded clips of each split: train 6, val 2, test 0",
+    ]
     data = MotionFolder(tmp_path / "data")
     assert data.ids("val") == ["clip6", "Mclip6", "clip7", "Mclip7"]
     clips = {clip.id: clip for clip in data.clips("train")}
     assert clips["clip0"].captions[1].text == "someone raises the left hand 0"
     assert clips["Mclip0"].captions[1].text == "someone raises the right hand 0"
     assert clips["clip0"].features.shape == (69, 263)
+
+
+def test_clips_that_training_leaves_out_are_said(
+    joint_folder: Path, command: Command, tmp_path: Path
+) -> None:
+    walk = np.load(joint_folder / "clip0.npy")
+    for name, frames, caption in (("long", 201, "walks"), ("short", 40, "walks"), ("silent", 60, "")):
+        np.save(tmp_path / f"{name}.npy", np.resize(walk, (frames, 22, 3)))
+        if caption:
+            (tmp_path / f"{name}.txt").write_text(caption)
+    with pytest.warns(UserWarning, match="No clip is for validation") as said:
+        command("prepare", "--joints", tmp_path, "--out", tmp_path / "data", "--quiet")
+    none_to_validate, silent, odd = (str(warning.message) for warning in said)
+    assert none_to_validate.startswith("No clip is for validation")
+    assert silent.startswith("1 of 3 clips have no caption")
+    assert odd.startswith("2 of 3 clips do not have 40 to 199 frames")
+
+
+def test_centimetres_are_refused(joint_folder: Path, refused: Command, tmp_path: Path) -> None:
+    np.save(tmp_path / "giant.npy", 100 * np.load(joint_folder / "clip0.npy"))
+    message = refused("prepare", "--joints", tmp_path, "--out", tmp_path / "data", "--quiet")
+    assert _matches(r"giant\.npy: a shin is 4\d(\.\d)? m long. Joints must be in metres", message)
 
 
 def test_packs_give_only_the_sources_that_may_be_published(
@@ -117,3 +143,7 @@ def test_an_unknown_source_lists_the_known_ones(refused: Command, pack_folder: P
     assert "has no source amass. It has: bandai_namco, cmu, cmu_dance, hdm05" in refused(
         "prepare", *arguments
     )
+
+
+def _matches(pattern: str, message: str) -> bool:
+    return re.search(pattern, message) is not None

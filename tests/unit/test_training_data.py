@@ -245,7 +245,7 @@ def test_long_clips_are_cropped_to_the_longest_sequence(identity, tokenizer):
 
 def test_clips_without_captions_or_length_are_refused(identity, tokenizer):
     clips = [clip_of("a", 39), clip_of("b", 200), FeatureClip("c", torch.zeros(60, 263), ())]
-    with pytest.raises(ValueError, match="No clip has a caption and 40 to 199 frames"):
+    with pytest.raises(ValueError, match="No clip of a split has a caption and 40 to 199 frames"):
         TokenSampler(clips, identity, tokenizer, TEXT, progress=False)
 
 

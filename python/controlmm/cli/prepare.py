@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from controlmm.cli.output_folder import writable_folder
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -18,13 +21,16 @@ SHIPPABLE_SOURCES = ("cmu", "cmu_dance", "bandai_namco")
 
 
 def prepare(
-    out: Annotated[Path, typer.Option(help="Folder to write; is made.")],
+    out: Annotated[Path, typer.Option(help="Folder to write; is made.", callback=writable_folder)],
     packs: Annotated[
         Path | None, typer.Option(help="Folder of .npz packs with captions.jsonl, already canonical.")
     ] = None,
     joints: Annotated[
         Path | None,
-        typer.Option(help="Folder of NAME.npy joints (F, 22, 3) in metres, with captions in NAME.txt."),
+        typer.Option(
+            help="Folder of NAME.npy joints (F, 22, 3) in metres, Y up, 20 fps, with captions in NAME.txt; "
+            "val.txt and test.txt list the names of those splits."
+        ),
     ] = None,
     sources: Annotated[
         str | None,
@@ -52,13 +58,14 @@ def prepare(
 ) -> None:
     """Turn joint positions into a folder in HumanML3D's layout, to train on."""
     from controlmm.data import write_folder
+    from controlmm.data.tally import Tally
 
     for folder in (packs, joints):
         if folder is not None and not folder.is_dir():  # before anything is written
             raise FileNotFoundError(f"No folder at {folder}.")
-    clips = _clips(packs, joints, sources)
+    tally = Tally()
     count = write_folder(
-        clips,
+        tally.counted(_clips(packs, joints, sources)),
         out,
         mirror=mirror,
         retarget_bones=retarget,
@@ -67,6 +74,9 @@ def prepare(
         progress=not quiet,
     )
     typer.echo(f"{out}: {count} clips{', mirrored ones included' if mirror else ''}")
+    typer.echo(f"recorded clips of each split: {tally.splits()}")
+    for caution in tally.cautions():
+        warnings.warn(caution, stacklevel=2)
 
 
 def _clips(packs: Path | None, joints: Path | None, sources: str | None) -> Iterator[Clip]:

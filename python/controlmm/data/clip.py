@@ -9,6 +9,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 SPLITS = ("train", "val", "test")
+# Frames of the clips that transformers are trained and judged on, by the skeleton's unit (KIT-ML: 12.5 fps).
+FEWEST_FRAMES = {"m": 40, "mm": 24}
+MOST_FRAMES = 199
 
 
 @dataclass(frozen=True)

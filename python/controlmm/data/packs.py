@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import zipfile
 import zlib
 from collections.abc import Collection, Iterator
@@ -13,8 +14,10 @@ import numpy as np
 import torch
 
 from controlmm.data.clip import SPLITS, Caption, Clip, parse_caption
+from controlmm.motion.skeleton import HUMANML3D
 
 CAPTIONS_FILE = "captions.jsonl"
+_SHORTEST_SHIN, _LONGEST_SHIN = 0.05, 2.0  # metres; a grown person's has 0.4
 _RECORD_KEYS = {"id", "file", "source", "licence", "split", "captions", "caption_kinds"}
 
 
@@ -63,7 +66,7 @@ def read_joint_folder(folder: Path) -> Iterator[Clip]:
 
     Raises:
         FileNotFoundError: If the folder does not exist or holds no ``.npy`` file.
-        ValueError: If a file is damaged.
+        ValueError: If a file is damaged, or its joints are not in metres.
     """
     files = sorted(folder.glob("*.npy")) if folder.is_dir() else []
     if not files:
@@ -74,8 +77,19 @@ def read_joint_folder(folder: Path) -> Iterator[Clip]:
             joints = torch.from_numpy(np.load(file, allow_pickle=False))
         except (ValueError, EOFError, OSError, TypeError) as error:
             raise ValueError(f"{file} is not a readable .npy file: {error}") from error
+        _check_unit(joints, file)
         captions = tuple(parse_caption(line) for line in _lines(file.with_suffix(".txt")))
         yield Clip(file.stem, joints, captions, source=folder.name, split=split_of.get(file.stem, "train"))
+
+
+def _check_unit(joints: torch.Tensor, file: Path) -> None:
+    """Refuse bodies of giants: recordings are often in centimetres, and nothing later would notice."""
+    if joints.ndim != 3 or joints.shape[1:] != (HUMANML3D.num_joints, 3):
+        return  # KIT-ML, or refused later
+    knee, ankle = HUMANML3D.leg_bones
+    shin = (joints[:, knee] - joints[:, ankle]).norm(dim=-1).median().item()
+    if not _SHORTEST_SHIN < shin < _LONGEST_SHIN and math.isfinite(shin):
+        raise ValueError(f"{file}: a shin is {shin:.3g} m long. Joints must be in metres.")
 
 
 class _Pack:

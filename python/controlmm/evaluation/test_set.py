@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from controlmm.data import Caption, FeatureClip, MotionFolder, read_packs
+from controlmm.data.clip import FEWEST_FRAMES, MOST_FRAMES
 from controlmm.data.packs import CAPTIONS_FILE
 from controlmm.evaluation.random_streams import draw, stream
 from controlmm.motion.features import joints_to_features
@@ -24,8 +25,6 @@ from controlmm.motion.skeleton import Skeleton, skeleton_of_width
 MAX_FRAMES, UNIT = 196, 4
 SCORED_KINDS = ("annotator", "written", "kinematic")  # templates of test occur in train too
 ALL = "all"  # the split that is every clip
-_LONGEST = 199
-_SHORTEST = {"m": 40, "mm": 24}  # by the skeleton's unit: HumanML3D and KIT-ML
 _TAG_FPS = 20  # times of captions are turned into frames with it, for KIT-ML's 12.5 fps too
 
 
@@ -139,14 +138,14 @@ def read_test_set(
 
 def items_of(clip: FeatureClip, kinds: Collection[str]) -> Iterator[Item]:
     """The clip with all captions about the whole of it, and an item for each caption about a part."""
-    shortest = _SHORTEST[skeleton_of_width(clip.features.shape[1]).unit]
+    shortest = FEWEST_FRAMES[skeleton_of_width(clip.features.shape[1]).unit]
     captions = [caption for caption in clip.captions if caption.kind in kinds]
     whole = tuple(caption for caption in captions if not caption.is_partial)
-    if whole and shortest <= len(clip.features) <= _LONGEST:
+    if whole and shortest <= len(clip.features) <= MOST_FRAMES:
         yield Item(clip.id, clip.features, whole, clip.source)
     for number, caption in enumerate(captions):
         part = clip.features[int(caption.start * _TAG_FPS) : int(caption.end * _TAG_FPS)]
-        if caption.is_partial and shortest <= len(part) <= _LONGEST:
+        if caption.is_partial and shortest <= len(part) <= MOST_FRAMES:
             yield Item(f"{clip.id}@{number}", part, (caption,), clip.source)
 
 

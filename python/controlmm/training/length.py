@@ -11,17 +11,15 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import cross_entropy
 
-from controlmm.data.clip import FeatureClip
+from controlmm.data.clip import FEWEST_FRAMES, MOST_FRAMES, FeatureClip
 from controlmm.models.length_estimator import LengthEstimator, LengthEstimatorConfig
 from controlmm.motion.skeleton import skeleton_of_width
 from controlmm.training.recipe import Recipe
 from controlmm.training.settings import TrainingSettings
 from controlmm.training.stage import Stage, StageInputs, by_size
-from controlmm.training.tokens import MAX_FRAMES, MIN_FRAMES
 from controlmm.training.windows import source_weights
 
 _FRAMES_A_TOKEN = 4
-_SHORTEST = {"m": MIN_FRAMES, "mm": 24}  # frames, by the skeleton's unit: KIT-ML's clips are at 12.5 fps
 _PAPER = TrainingSettings(
     steps=110_000,  # 300 epochs of HumanML3D
     batch_size=64,
@@ -70,7 +68,7 @@ class LengthPairs:
                 frames = len(clip.features)
                 if caption.is_partial:
                     frames = min(int(caption.end * skeleton.fps), frames) - int(caption.start * skeleton.fps)
-                if _SHORTEST[skeleton.unit] <= frames <= MAX_FRAMES:
+                if FEWEST_FRAMES[skeleton.unit] <= frames <= MOST_FRAMES:
                     count = min(frames // _FRAMES_A_TOKEN, most)
                     rows.append((caption.text, count, clip.source, 1 / len(clip.captions)))
         if not rows:

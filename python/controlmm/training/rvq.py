@@ -81,7 +81,7 @@ class RvqRecipe:
         self._windows = WindowSampler(train_clips, normalizer, length=WINDOW)
         self._val_clips = [clip for clip in val_clips if len(clip.features) >= config.downsample]
         if not self._val_clips:
-            raise ValueError("The validation split has no readable clip.")
+            raise ValueError("The validation split has no readable clip. List some names in val.txt.")
         self._positions = feature_layout(normalizer.skeleton).local_positions
 
     def loss(self, batch_size: int) -> dict[str, Tensor]:

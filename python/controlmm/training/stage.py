@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from controlmm.data.clip import FeatureClip
+from controlmm.data.clip import FEWEST_FRAMES, FeatureClip
 from controlmm.data.folder import MotionFolder
 from controlmm.models.part_vq_vae import PartVqVae
 from controlmm.models.rvq_vae import RvqVae
@@ -23,12 +23,11 @@ from controlmm.training.augmentation import Augmentation, augmented
 from controlmm.training.level_ground import ClipSelection, select
 from controlmm.training.recipe import Recipe, Sample
 from controlmm.training.settings import TrainingSettings
-from controlmm.training.tokens import MIN_FRAMES, TokenSampler
+from controlmm.training.tokens import TokenSampler
 
 NORMALIZER_FILE = "normalizer.safetensors"
 SIZES = ("small", "paper", "tiny")
 _REFINERS = {"rvq": "rvq-decoder", "tl-vq": "tl-decoder"}  # of the tokenizers' decoders
-_MIN_FRAMES_KIT = 24  # KIT-ML's clips are at 12.5 fps, so its shortest are shorter
 _Tokenizer = TypeVar("_Tokenizer", bound=MotionTokenizer)
 
 
@@ -80,7 +79,7 @@ class StageInputs:
         tokenizer = load_tokenizer(self.root)[0] if tokenizer is None else tokenizer
         normalizer = Normalizer.load(self.root / NORMALIZER_FILE)
         features = self.text_features()
-        shortest = MIN_FRAMES if normalizer.skeleton.unit == "m" else _MIN_FRAMES_KIT
+        shortest = FEWEST_FRAMES[normalizer.skeleton.unit]
         train, val = (
             TokenSampler(clips, normalizer, tokenizer, features, progress=self.progress, min_frames=shortest)
             for clips in (self.train_clips, self.val_clips)

@@ -11,13 +11,12 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 from tqdm import tqdm
 
-from controlmm.data.clip import Caption, FeatureClip
+from controlmm.data.clip import FEWEST_FRAMES, MOST_FRAMES, Caption, FeatureClip
 from controlmm.models.rvq_vae import frame_mask
 from controlmm.models.tokenizer import MotionTokenizer
 from controlmm.motion.normalizer import Normalizer
 from controlmm.training.windows import source_weights
 
-MIN_FRAMES, MAX_FRAMES = 40, 199  # of clips used for the transformers (KIT-ML: from 24)
 _ENCODE_BATCH = 64
 _DROP_UNIT = 1 / 3  # share of samples that are one token shorter than they could be
 _LONGEST = 196
@@ -75,7 +74,7 @@ class TokenSampler:
         text_features: Mapping[str, Float[Tensor, "E"]],
         *,
         progress: bool = True,
-        min_frames: int = MIN_FRAMES,
+        min_frames: int = FEWEST_FRAMES["m"],
     ) -> None:
         self.downsample = tokenizer.config.downsample
         self._features = [normalizer.normalize(clip.features) for clip in clips]
@@ -87,7 +86,10 @@ class TokenSampler:
             for item in _items_of(index, clip, fps, min_frames=min_frames)
         ]
         if not self._items:
-            raise ValueError(f"No clip has a caption and {min_frames} to {MAX_FRAMES} frames.")
+            raise ValueError(
+                f"No clip of a split has a caption and {min_frames} to {MOST_FRAMES} frames, which this "
+                "stage is trained and validated on. Add captions, and cut long clips into pieces."
+            )
         self._ids = tokenize(self._features, tokenizer, progress=progress)
         sources = [clips[item.clip].source for item in self._items]
         self._weights = source_weights(sources, [1] * len(self._items))
@@ -141,11 +143,11 @@ def _items_of(index: int, clip: FeatureClip, fps: float, *, min_frames: int) -> 
     """The clip with its whole-clip captions, and one item for every caption about a part of it."""
     items = []
     whole = [caption for caption in clip.captions if not caption.is_partial]
-    if whole and min_frames <= len(clip.features) <= MAX_FRAMES:
+    if whole and min_frames <= len(clip.features) <= MOST_FRAMES:
         items.append(_Item(index, 0, len(clip.features), _by_kind(whole)))
     for caption in clip.captions:
         start, end = int(caption.start * fps), min(int(caption.end * fps), len(clip.features))
-        if caption.is_partial and min_frames <= end - start <= MAX_FRAMES:
+        if caption.is_partial and min_frames <= end - start <= MOST_FRAMES:
             items.append(_Item(index, start, end, ((caption.text,),)))
     return items
 
