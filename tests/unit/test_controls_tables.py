@@ -64,8 +64,12 @@ def test_column_order_case_spaces_index_and_byte_order_mark(tmp_path):
         ("", "line 1: the columns must be frame,joint,x,y,z, got nothing."),
         ("0,pelvis,0,0,0\n", "line 1: the columns must be frame,joint,x,y,z, got 0,pelvis,0,0,0."),
         ("frame,joint,x,y,z\n", "the table has no rows, so it controls nothing."),
-        ("frame,joint,x,y,z\n0,pelvis,0,0\n", "line 2: expected 5 values (frame,joint,x,y,z)."),
-        ("frame,joint,x,y,z\n0,pelvis,0,0,0,0\n", "line 2: expected 5 values (frame,joint,x,y,z)."),
+        (
+            "frame;joint;x;y;z\n0;pelvis;0;0;0\n",
+            "line 1: the columns must be frame,joint,x,y,z, got frame;joint;x;y;z. Separate them by commas.",
+        ),
+        ("frame,joint,x,y,z\n0,pelvis,0,0\n", "line 2: expected 5 values (frame,joint,x,y,z), got 4."),
+        ("frame,joint,x,y,z\n0,pelvis,0,0,0,0\n", "line 2: expected 5 values (frame,joint,x,y,z), got 6."),
         (
             "frame,joint,x,y,z\n0,pelvis,0,0,0\n1.5,pelvis,0,0,0\n",
             "line 3: `frame` must be a whole number from 0, got '1.5'.",
@@ -91,8 +95,8 @@ def test_column_order_case_spaces_index_and_byte_order_mark(tmp_path):
         ("frame,joint,x,y,z\n7,pelvis,,,\n", "joint pelvis: Every axis is free at frame 7."),
     ],
     ids=[
-        "empty", "no header", "no rows", "short row", "long row", "frame 1.5", "frame -1", "no joint", "text",
-        "unknown joint", "nan", "doubled", "all free",
+        "empty", "no header", "no rows", "semicolons", "short row", "long row", "frame 1.5", "frame -1",
+        "no joint", "text", "unknown joint", "nan", "doubled", "all free",
     ],
 )  # fmt: skip
 def test_a_mistake_in_a_table_is_named(tmp_path, text, expected):

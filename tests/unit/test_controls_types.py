@@ -95,6 +95,20 @@ def test_a_misspelt_joint_gets_a_suggestion(name):
         JointControl(name, [0], [POINT])
 
 
+@pytest.mark.parametrize(
+    ("name", "ours"),
+    [
+        ("left_hand", "left_wrist"),
+        ("LeftHand", "left_wrist"),
+        ("right toe", "right_foot"),
+        ("hips", "pelvis"),
+    ],
+)
+def test_other_skeletons_words_get_a_suggestion(name, ours):
+    with pytest.raises(ValueError, match=rf'^Unknown joint "{name}"\. Did you mean "{ours}"\?'):
+        JointControl(name, [0], [POINT])
+
+
 def test_a_joint_of_another_skeleton_is_found_out_when_the_clip_is_made():
     control = JointControl("LW", [0], [POINT])
     assert control.sample(1, KIT).joints.tolist() == [7]

@@ -102,7 +102,7 @@ def test_without_milestones_the_rate_falls_by_a_cosine_to_a_hundredth():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"steps": 0}, "`steps`, `batch_size`, `shards` and the intervals must be at least 1"),
+        ({"steps": 0}, "`steps` must be at least 1, got 0"),
         ({"batch_size": 0}, "must be at least 1"),
         ({"shards": 0}, "must be at least 1"),
         ({"validate_every": 0}, "must be at least 1"),

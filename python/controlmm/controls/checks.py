@@ -15,6 +15,8 @@ from torch import Tensor
 from controlmm.motion.skeleton import HUMANML3D, SKELETONS, Skeleton
 
 AXES = "xyz"
+# What other skeletons call our joints, for suggestions.
+_OTHER_WORDS = {"hand": "wrist", "toe": "foot", "hips": "pelvis", "root": "pelvis", "chest": "spine3"}
 
 
 def resolve_joint(joint: str | int, skeleton: Skeleton) -> int:
@@ -143,7 +145,10 @@ def _refuse_doubles(numbers: list[int]) -> None:
 
 
 def _unknown_joint(joint: str, skeleton: Skeleton) -> str:
-    near = difflib.get_close_matches(joint.lower().replace(" ", "_"), skeleton.joint_names, n=1)
+    name = joint.lower().replace(" ", "_")
+    for word, ours in _OTHER_WORDS.items():
+        name = name.replace(word, ours)
+    near = difflib.get_close_matches(name, skeleton.joint_names, n=1)
     suggestion = f' Did you mean "{near[0]}"?' if near else ""
     names = ", ".join(skeleton.joint_names)
     return f'Unknown joint "{joint}".{suggestion} The {skeleton.name} skeleton has: {names}.'

@@ -24,8 +24,9 @@ def parse_csv(content: bytes) -> ControlFile:
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"not a CSV table in UTF-8 ({error}).") from error
     if sorted(names) != sorted(COLUMNS):
+        cure = " Separate them by commas." if any(";" in name or "\t" in name for name in names) else ""
         raise ValueError(
-            f"line 1: the columns must be {','.join(COLUMNS)}, got {','.join(names) or 'nothing'}."
+            f"line 1: the columns must be {','.join(COLUMNS)}, got {','.join(names) or 'nothing'}.{cure}"
         )
     reader.fieldnames = names
     rows: dict[str | int, list[_Row]] = {}
@@ -39,7 +40,9 @@ def parse_csv(content: bytes) -> ControlFile:
 
 def _parse_row(cells: dict[str | None, str | None], line: int) -> tuple[str | int, _Row]:
     if None in cells or None in cells.values():
-        raise ValueError(f"line {line}: expected {len(COLUMNS)} values ({','.join(COLUMNS)}).")
+        named = [text for name, text in cells.items() if name is not None and text is not None]
+        count = len(named) + len(cells.get(None) or ())
+        raise ValueError(f"line {line}: expected {len(COLUMNS)} values ({','.join(COLUMNS)}), got {count}.")
     texts = {name: (text or "").strip() for name, text in cells.items()}
     if not texts["frame"].isdecimal():
         raise ValueError(f"line {line}: `frame` must be a whole number from 0, got {texts['frame']!r}.")

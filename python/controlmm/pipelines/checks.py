@@ -24,6 +24,7 @@ from controlmm.motion.skeleton import Skeleton
 
 MIN_FRAMES = 8
 _DEFAULT_SECONDS = 6.0
+_LARGEST_SEED = 2**63 - 1  # of torch's generators
 
 
 def frame_count(*, seconds: float | None, frames: int | None, skeleton: Skeleton, max_frames: int) -> int:
@@ -52,10 +53,12 @@ def frame_count(*, seconds: float | None, frames: int | None, skeleton: Skeleton
 
 
 def check_sampling(*, samples: int, seed: int) -> None:
-    """Raise ``ValueError`` unless ``samples`` is a positive and ``seed`` a non-negative whole number."""
+    """Raise ``ValueError`` unless ``samples`` is a whole number from 1, ``seed`` one from 0 below 2^63."""
     for name, value, least in (("samples", samples, 1), ("seed", seed, 0)):
         if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
             raise ValueError(f"`{name}` must be a whole number of at least {least}, got {value!r}.")
+    if seed > _LARGEST_SEED:
+        raise ValueError(f"`seed` must be at most {_LARGEST_SEED} (2^63 - 1), got {seed}.")
 
 
 def check_objectives(

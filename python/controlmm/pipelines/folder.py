@@ -28,8 +28,8 @@ def resolve_folder(path: str | Path | None, *, shipped: str = "controlmm") -> Pa
     folder = Path(name) if Path(name).is_dir() or name not in SHIPPED else shipped_folder(SHIPPED[name])
     if not folder.is_dir():
         raise FileNotFoundError(
-            f"No model folder at {folder}. Pass a folder written by `save_pretrained`, or the name of a "
-            f"model that comes with the package: {', '.join(SHIPPED)}."
+            f"No model folder at {folder}. Pass one that `controlmm assemble` or `save_pretrained` wrote, or "
+            f"the name of a model that comes with the package: {', '.join(SHIPPED)}."
         )
     if not (folder / PIPELINE_FILE).is_file():
         raise FileNotFoundError(

@@ -28,10 +28,9 @@ class TrainingSettings:
     seed: int = 3407
 
     def __post_init__(self) -> None:
-        if min(self.steps, self.batch_size, self.shards, self.validate_every, self.checkpoint_every) < 1:
-            raise ValueError(
-                f"`steps`, `batch_size`, `shards` and the intervals must be at least 1, got {self}."
-            )
+        for name in ("steps", "batch_size", "shards", "validate_every", "checkpoint_every"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"`{name}` must be at least 1, got {getattr(self, name)}.")
         if self.patience < 0:
             raise ValueError(f"`patience` must be 0 (never) or a number of validations, got {self.patience}.")
         if not 0 <= self.average_decay < 1:
