@@ -157,10 +157,15 @@ BAD_FILES = {
     ),
     "NaN in a table": ("nan.csv", "frame,joint,x,y,z\n0,pelvis,nan,0.9,0\n", r"must be finite, got \(nan"),
     "broken JSON": ("broken.json", '{"version": 1, ', r"broken JSON at line 1, column 16"),
+    "too short": (
+        "short.json",
+        '{"version": 1, "units": "m", "up": "y", "fps": 20, "seconds": 0.2, "controls": []}',
+        r"short\.json is 0\.2 s long, a motion is 0\.4 to 9\.8 s",
+    ),
     "too long": (
         "long.json",
         _joint_control("pelvis", 1, 0.0).replace('"seconds": 6.0', '"seconds": 12'),
-        r"is 12 s long, a motion is at most 9\.8 s",
+        r"is 12 s long, a motion is 0\.4 to 9\.8 s",
     ),
 }
 
@@ -194,6 +199,13 @@ BAD_OPTIONS = {
     "too long": (["walk", "--seconds", "11"], r"`seconds` must be between 0\.4 and 9\.8, got 11"),
     "no samples": (["walk", "--samples", "0"], r"`samples` must be a whole number of at least 1"),
     "negative seed": (["walk", "--seed", "-1"], r"`seed` must be a whole number of at least 0"),
+    "seed too large": (["walk", "--seed", str(2**63)], r"`seed` must be at most 9223372036854775807"),
+    "prompt without quotes": (["a", "person", "walks"], r'in quotes, .*generate "a person walks"'),
+    "tolerance without a number": (
+        ["walk", "--tolerance", "small"],
+        r"`tolerance` must be a positive number of m or text such as '5mm' or '5cm', got 'small'",
+    ),
+    "time budget in minutes": (["walk", "--time-budget", "2min"], r"`time_budget` must be .*got '2min'"),
 }
 
 
@@ -205,6 +217,30 @@ def test_bad_options_are_refused_in_one_line(
     model = [] if "--model" in arguments else ["--model", tiny_pipeline_folder]
     assert _matches(pattern, refused("generate", *arguments, *model, "--out", tmp_path / "out"))
     assert not (tmp_path / "out").exists()
+
+
+def test_a_file_in_place_of_the_folder_is_refused_before_anything_is_generated(
+    refused: Command, tmp_path: Path
+) -> None:
+    (tmp_path / "taken").write_text("mine")
+    for out in (tmp_path / "taken", tmp_path / "taken" / "deeper"):
+        # A missing model would be the next thing to be refused.
+        message = refused("generate", "walk", "--model", "nowhere", "--out", out)
+        assert f"`--out` needs a folder, but {tmp_path / 'taken'} is a file" in message
+    assert (tmp_path / "taken").read_text() == "mine"
+
+
+def test_a_tolerance_replaces_the_presets(
+    command: Command, tiny_pipeline_folder: Path, walk_line: Path, tmp_path: Path
+) -> None:
+    def error(*options: str) -> float:
+        printed = command(
+            "generate", PROMPT, "--controls", walk_line, "--formats", "npz", "--out", tmp_path, "--model",
+            tiny_pipeline_folder, *options,
+        )  # fmt: skip
+        return float(printed.splitlines()[2].split()[1])
+
+    assert error() == error("--tolerance", "0.003") < error("--tolerance", "1m")
 
 
 @pytest.mark.parametrize("part", ["tokenizer", "transformer", "residual", "control"])

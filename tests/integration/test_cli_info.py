@@ -66,7 +66,7 @@ def test_help_does_not_load_torch() -> None:
 
 def test_the_installed_command_prints_one_line_for_an_error(tmp_path: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "controlmm.cli.main", "generate", "--controls", "missing.json"],
+        [sys.executable, "-m", "controlmm", "generate", "--controls", "missing.json"],
         capture_output=True, text=True, check=False, cwd=tmp_path,
     )  # fmt: skip
     assert (done.returncode, done.stdout) == (2, "")

@@ -143,7 +143,11 @@ def test_missing_folders_are_named(
 def test_a_stage_asks_for_the_one_before(data: Path, refused: Command, tmp_path: Path) -> None:
     arguments = ("--data", data, "--config", "tiny", "--text", "hashing", "--out", tmp_path, "--quiet")
     assert "Run `controlmm train rvq` with the same --out first" in refused("train", "masked", *arguments)
-    assert "Run `controlmm train rvq`" in refused("assemble", tmp_path, "--out", tmp_path / "model")
+    message = refused("assemble", tmp_path, "--out", tmp_path / "model")
+    assert (
+        f"No trained stage in {tmp_path}. Pass the folder that `controlmm train STAGE --out` wrote to"
+        in message
+    )
 
 
 def test_other_settings_do_not_resume_a_run(root: Path, data: Path, refused: Command) -> None:
@@ -266,7 +270,7 @@ def test_a_killed_run_ends_with_the_weights_of_an_unbroken_one(
 def _kill_after_a_checkpoint(arguments: list[str], run: Path) -> None:
     """Start a training as its own process and end it with SIGKILL as soon as it has written a checkpoint."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "controlmm.cli.main", *arguments], env={**os.environ, "OMP_NUM_THREADS": "1"}
+        [sys.executable, "-m", "controlmm", *arguments], env={**os.environ, "OMP_NUM_THREADS": "1"}
     )
     deadline = time.monotonic() + PATIENCE
     while not (run / "checkpoint.safetensors").is_file():

@@ -8,6 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
 
+from controlmm.cli.output_folder import writable_folder
+from controlmm.training.registry import MODULES
+
 if TYPE_CHECKING:
     from controlmm.nn.checkpoint import PretrainedModel
     from controlmm.pipelines.pipeline import MotionPipeline
@@ -18,7 +21,7 @@ _Network = TypeVar("_Network", bound="PretrainedModel")
 
 def assemble(
     root: Annotated[Path, typer.Argument(help="Folder that `controlmm train --out` filled.")],
-    out: Annotated[Path, typer.Option(help="Model folder to write.")],
+    out: Annotated[Path, typer.Option(help="Model folder to write.", callback=writable_folder)],
     half: Annotated[bool, typer.Option("--half", help="Store weights as float16: half the size.")] = False,
     text: Annotated[
         Literal["minilm", "clip", "hashing"] | None,
@@ -33,6 +36,10 @@ def assemble(
 
     from controlmm.training.run_folder import SETTINGS_FILE
 
+    if not any((root / stage).is_dir() for stage in MODULES):
+        raise FileNotFoundError(
+            f"No trained stage in {root}. Pass the folder that `controlmm train STAGE --out` wrote to."
+        )
     encoder = _text_encoder(root, text, text_folder)
     pipeline, stages = (_tlcontrol if (root / "tl-mtt").is_dir() else _controlmm)(root, encoder)
     pipeline.save_pretrained(out, dtype=torch.float16 if half else torch.float32)

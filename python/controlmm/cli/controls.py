@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from controlmm.cli.output_folder import writable_file
+
 if TYPE_CHECKING:
     from controlmm.controls import ControlFile
 
 controls_app = typer.Typer(no_args_is_help=True, help="Write an example control file.")
 
-_Out = Annotated[Path, typer.Option(help="The .json file to write.")]
+_Out = Annotated[Path, typer.Option(help="The .json file to write.", callback=writable_file)]
 _Joint = Annotated[str, typer.Option(help="The joint that is led.")]
 _Seconds = Annotated[
     float | None,

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from controlmm.cli.interruption import resumable
+from controlmm.cli.output_folder import writable_folder
 
 if TYPE_CHECKING:
     from controlmm.evaluation.control_draws import ControlSetting
@@ -24,7 +25,10 @@ KINDS = "annotator,written,kinematic"
 
 def evaluate(
     data: Annotated[Path, typer.Option(help="HumanML3D / KIT-ML folder, or a folder of npz packs.")],
-    out: Annotated[Path, typer.Option(help="Folder for results; the same command goes on in it.")],
+    out: Annotated[
+        Path,
+        typer.Option(help="Folder for results; the same command goes on in it.", callback=writable_folder),
+    ],
     model: Annotated[
         list[Path] | None,
         typer.Option(help="Model folder; again for more. By default the model that comes with the package."),

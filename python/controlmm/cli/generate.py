@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from controlmm.cli.output_folder import writable_folder
 from controlmm.cli.phase_bars import PhaseBars
 from controlmm.cli.table import format_table
 
@@ -25,6 +26,7 @@ _PER_METRE = {"m": 1.0, "mm": 1000.0}  # of a skeleton's unit
 
 
 def generate(
+    context: typer.Context,
     prompt: Annotated[
         str | None, typer.Argument(help="What the person does. By default the control file's prompt.")
     ] = None,
@@ -60,7 +62,11 @@ def generate(
         bool, typer.Option("--loose", help="Keep tokens only: kept poses may shift on the ground.")
     ] = False,
     preset: Annotated[
-        str, typer.Option(help="fast, balanced or accurate; with paper- in front as in the papers.")
+        str,
+        typer.Option(
+            help="fast, balanced or accurate: within 1 cm, 3 mm, 1 mm. exact: on the targets, bones whole. "
+            "paper-fast, paper-medium, paper-accurate: the papers' steps."
+        ),
     ] = "balanced",
     naturalness: Annotated[
         float | None,
@@ -68,6 +74,16 @@ def generate(
             help="How strongly editing keeps feet, floor and uncontrolled joints as they were; 0 not at all.",
             show_default=False,
         ),
+    ] = None,
+    tolerance: Annotated[
+        str | None,
+        typer.Option(
+            help="Control error at which to stop, such as 5mm. By default the preset's.", show_default=False
+        ),
+    ] = None,
+    time_budget: Annotated[
+        str | None,
+        typer.Option(help="Time for editing, such as 500ms or 2s. By default none.", show_default=False),
     ] = None,
     samples: Annotated[int, typer.Option(help="Number of motions.")] = 1,
     vary: Annotated[
@@ -78,14 +94,23 @@ def generate(
     formats: Annotated[
         str, typer.Option(help="Files to write, comma-separated: npz, npy, bvh, glb, png, gif, mp4.")
     ] = "npz,bvh,png",
-    out: Annotated[Path, typer.Option(help="Folder for the files; is made.")] = Path("out"),
+    out: Annotated[
+        Path,
+        typer.Option(
+            help="Folder for the files, which prompt and seed name; is made. Older files are replaced.",
+            callback=writable_folder,
+        ),
+    ] = Path("out"),
     model: Annotated[
         Path | None,
         typer.Option(help="Model folder, or controlmm or tlcontrol, which come with the package."),
     ] = None,
     guidance: Annotated[
         float | None,
-        typer.Option(help="How strongly the text counts. By default the preset's.", show_default=False),
+        typer.Option(
+            help="How strongly the text counts; 1 is without guidance. By default what suits the model.",
+            show_default=False,
+        ),
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but the names of the files.")] = False,
 ) -> None:
@@ -100,6 +125,9 @@ def generate(
     from controlmm.controls import load_controls
     from controlmm.motion.motion import Motion
 
+    if context.args:
+        words = " ".join([prompt or "", *context.args])
+        raise ValueError(f'Put the prompt in quotes, it is one argument: controlmm generate "{words}".')
     suffixes = _checked_formats(formats)
     document = load_controls(controls) if controls else None
     entries = timeline_entries(document, timeline)
@@ -111,9 +139,7 @@ def generate(
     if entries and prompt is not None:
         raise ValueError("A timeline has prompts of its own. Leave the prompt out.")
     prompt = entries[0].prompt if entries else _chosen_prompt(prompt, document)
-    options: dict[str, Any] = {
-        "samples": samples, "seed": seed
-    }  # fmt: skip
+    options: dict[str, Any] = {"samples": samples, "seed": seed}
     held = document.controls if document else ()
     source = Motion.load(edit) if edit else None
     if source is not None:
@@ -128,7 +154,12 @@ def generate(
         raise ValueError("`--vary` needs a TLControl model, for example: --model tlcontrol.")
     parts: dict[str, Any] = {} if vary is None else {"vary": vary}
     with PhaseBars(enabled=not quiet) as bars:
-        plan = pipeline.limited(pipeline.resolve_preset(preset, guidance), None, None, naturalness)
+        plan = pipeline.limited(
+            pipeline.resolve_preset(preset, guidance),
+            _quantity(tolerance),
+            _quantity(time_budget),
+            naturalness,
+        )
         options |= {"progress": bars, "preset": plan, **parts}
         if entries:
             options |= {} if method is None else {"method": method}
@@ -150,6 +181,14 @@ def generate(
     if not quiet:
         typer.echo(_report(result, has_fit=bool({"bvh", "glb"} & set(suffixes))) + "\n")
     typer.echo("\n".join(map(str, files)))
+
+
+def _quantity(text: str | None) -> str | float | None:
+    """A number without a unit as a number; what has one is read with the preset."""
+    try:
+        return text if text is None else float(text)
+    except ValueError:
+        return text
 
 
 def slug(prompt: str) -> str:
@@ -185,14 +224,14 @@ def _chosen_prompt(prompt: str | None, document: ControlFile | None) -> str:
 
 
 def _chosen_seconds(seconds: float | None, document: ControlFile | None, path: Path | None) -> float | None:
-    from controlmm.controls.shapes import MAX_SECONDS
+    from controlmm.controls.shapes import MAX_SECONDS, MIN_SECONDS
 
     if seconds is not None or document is None:
         return seconds
-    if document.seconds is not None and document.seconds > MAX_SECONDS:
+    if document.seconds is not None and not MIN_SECONDS <= document.seconds <= MAX_SECONDS:
         raise ValueError(
-            f"{path} is {document.seconds:g} s long, a motion is at most {MAX_SECONDS} s. Cut the file, or "
-            "pass `--seconds` if its controls end earlier."
+            f"{path} is {document.seconds:g} s long, a motion is {MIN_SECONDS} to {MAX_SECONDS} s. Change "
+            "the file, or pass `--seconds`, into which its controls must fit."
         )
     return document.seconds
 

@@ -50,8 +50,9 @@ def _options(
     """Text plus 3D control in, human motion out."""
 
 
+# Words beyond the first are a prompt without quotes: the command says so in words of its own.
+app.command(context_settings={"allow_extra_args": True})(generate)
 for _command in (
-    generate,
     info,
     prepare,
     train,
@@ -74,7 +75,3 @@ def main() -> None:
     """Entry point of the command."""
     warnings.showwarning = _show_warning
     app(prog_name="controlmm")
-
-
-if __name__ == "__main__":
-    main()

@@ -10,6 +10,7 @@ import typer
 
 from controlmm.cli.evaluate import KINDS, facts_of, listed
 from controlmm.cli.interruption import resumable
+from controlmm.cli.output_folder import writable_folder
 
 if TYPE_CHECKING:
     from controlmm.evaluation.controlmm_tables import Study
@@ -36,7 +37,8 @@ def reproduce(
         Path,
         typer.Option(
             help="Folder; every table gets one in it. Tables share what they have in common, and the same "
-            "command goes on."
+            "command goes on.",
+            callback=writable_folder,
         ),
     ],
     model: Annotated[

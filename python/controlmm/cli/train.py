@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from controlmm.cli.output_folder import writable_folder
 from controlmm.cli.run_pictures import CURVES_FILE
 from controlmm.training.registry import MODULES
 
@@ -25,7 +26,12 @@ def train(
         typer.Argument(help=f"One of: {', '.join(MODULES)}. Most need ones before them, trained already."),
     ],
     data: Annotated[Path, typer.Option(help="HumanML3D-style folder, see `controlmm prepare`.")],
-    out: Annotated[Path, typer.Option(help="Folder of the model; the stage gets a run folder in it.")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            help="Folder of the model; the stage gets a run folder in it.", callback=writable_folder
+        ),
+    ],
     config: Annotated[_Size, typer.Option(help="Size of the networks and length of the training.")] = "small",
     text: Annotated[_Text, typer.Option(help="Text encoder; the same for all stages.")] = "minilm",
     text_folder: Annotated[
