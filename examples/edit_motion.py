@@ -15,7 +15,7 @@ walk = pipeline("a person walks forward", seconds=6, seed=3).best
 walk.save("out/walk.npz")
 edits = {
     "middle": ("a person jumps", {"keep": [(0, 2), (4, 6)]}),
-    "end": ("a person sits down", {"keep": [(0, 3)]}),
+    "end": ("a person stops and bows", {"keep": [(0, 3)]}),
     "upper_body": ("a person waves both hands", {"keep_parts": ["lower"]}),
 }
 for name, (prompt, kept) in edits.items():
