@@ -32,7 +32,6 @@ def test_targets_land_at_their_frame_and_joint():
 def test_properties():
     dense = densify([JointControl(21, [0], [[0, 1, 0]]), JointControl("pelvis", [3], [[None, 1, None]])], 4)
     assert dense.controlled_joints == (0, 21)
-    assert dense.num_coordinates == 4
     assert dense.num_frames == 4
     assert not dense.is_empty
 

@@ -44,11 +44,6 @@ class DenseControls:
         """Indices of the joints that are controlled at some frame, in rising order."""
         return tuple(self.mask.any(dim=2).any(dim=0).nonzero()[:, 0].tolist())
 
-    @property
-    def num_coordinates(self) -> int:
-        """Number of controlled coordinates (x, y and z count one each)."""
-        return int(self.mask.sum())
-
 
 def densify(controls: Sequence[Control], num_frames: int, skeleton: Skeleton = HUMANML3D) -> DenseControls:
     """The controls of one clip as dense targets.

@@ -9,17 +9,6 @@ from numpy import ndarray
 _AXES = "XYZ"
 
 
-def check_order(order: str) -> str:
-    """``order`` itself, three different letters of X, Y, Z.
-
-    Raises:
-        ValueError: If it is not.
-    """
-    if sorted(order) != list(_AXES):
-        raise ValueError(f"`order` must hold each of X, Y and Z once, such as 'ZXY', got {order!r}.")
-    return order
-
-
 def matrix_from_euler(angles: Float[ndarray, "*B 3"], order: str) -> Float[ndarray, "*B 3 3"]:
     """Matrices of angles in radians; ``order`` "ZXY" means ``Rz Rx Ry`` (Y acts on a column first)."""
     first, second, third = (_axis_rotation(angles[..., i], _AXES.index(axis)) for i, axis in enumerate(order))

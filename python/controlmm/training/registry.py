@@ -28,8 +28,6 @@ MODULES = {
     "tl-mtt": "tl_mtt",
     "tl-unsplit": "tl_unsplit",
 }
-CONTROLMM_STAGES = ("rvq", "masked", "residual", "control", "residual-control")  # of a whole model
-TLCONTROL_STAGES = ("tl-vq", "tl-mtt")
 
 
 def load_stage(name: str) -> Stage:
