@@ -136,9 +136,9 @@ def test_other_settings_are_not_mixed_into_a_folder(
 ) -> None:
     rows = _rows(tiny_pipeline)[:1]
     evaluate_rows(rows, test_set, evaluator, Protocol(), tmp_path, progress=False)
-    with pytest.raises(ValueError, match="holds an evaluation with another protocol"):
+    with pytest.raises(ValueError, match=r"other settings: protocol\.seed \(0 before, 1 now\)\. Go on"):
         evaluate_rows(rows, test_set, evaluator, Protocol(seed=1), tmp_path, progress=False)
-    with pytest.raises(ValueError, match="holds an evaluation with another control"):
+    with pytest.raises(ValueError, match=r"other settings: control.* \(\"pelvis\" before, \"head\" now\)"):
         evaluate_rows(
             _rows(tiny_pipeline, "head")[:1], test_set, evaluator, Protocol(), tmp_path, progress=False
         )

@@ -167,7 +167,10 @@ def test_other_data_is_not_mixed_into_a_run(trained, tiny_data_folder, walk, tmp
 
     clips = [Clip(s, walk(70), (Caption("walks"),), split=s) for s in ("train", "val")]
     write_folder(clips, tmp_path, progress=False)
-    with pytest.raises(ValueError, match="masked holds a run with another captions, data"):
+    with pytest.raises(
+        ValueError,
+        match=r"masked holds a run with other settings: captions.*data\.train\.clips \(6 before, 2 now\)",
+    ):
         train("masked", tmp_path, trained)
 
 

@@ -208,7 +208,8 @@ def test_a_finished_run_takes_no_more_steps(tmp_path):
 def test_a_run_with_other_settings_is_refused(tmp_path):
     fit(LineRecipe(), tmp_path)
     with pytest.raises(
-        ValueError, match=r"holds a run with another settings\. Resume it with the same settings"
+        ValueError,
+        match=r"other settings: settings\.seed \(3407 before, 1 now\)\. Resume it with the same ones",
     ):
         fit(LineRecipe(), tmp_path, replace(SETTINGS, seed=1))
 
@@ -386,5 +387,5 @@ def test_a_run_from_before_a_setting_existed_is_resumed(tmp_path):
     recipe = LineRecipe()
     fit(recipe, tmp_path)
     assert recipe.calls == 0
-    with pytest.raises(ValueError, match="holds a run with another settings"):
+    with pytest.raises(ValueError, match=r"other settings: settings\.patience \(0 before, 4 now\)"):
         fit(recipe, tmp_path, replace(SETTINGS, patience=4))

@@ -33,14 +33,23 @@ def evaluate(
         list[Path] | None,
         typer.Option(help="Model folder; again for more. By default the model that comes with the package."),
     ] = None,
-    control: Annotated[str, typer.Option(help="A joint, or random, cross, lower, all, none.")] = "pelvis",
+    control: Annotated[
+        str,
+        typer.Option(
+            help="A joint, or several as left_wrist+head, or random (of six), cross (their combinations), "
+            "lower (pelvis and feet), all (six), none."
+        ),
+    ] = "pelvis",
     density: Annotated[
         str, typer.Option(help="Keyframes: 1, 2, 5, 49, 196, or all (drawn for each clip).")
     ] = "all",
-    preset: Annotated[list[str] | None, typer.Option(help="Preset; again for more.")] = None,
+    preset: Annotated[
+        list[str] | None, typer.Option(help="Preset, such as accurate; again for more. By default balanced.")
+    ] = None,
     repeats: Annotated[int, typer.Option(help="Times, each with other draws.")] = 1,
     limit: Annotated[
-        int | None, typer.Option(help="Clips a repeat; in whole batches of 32.", show_default="all")
+        int | None,
+        typer.Option(help="Clips a repeat, rounded down to whole batches of 32.", show_default="all"),
     ] = None,
     split: Annotated[str, typer.Option(help="train, val, test; all for every clip.")] = "test",
     captions: Annotated[str, typer.Option(help="Kinds of captions, comma-separated.")] = KINDS,

@@ -47,13 +47,16 @@ def train(
     steps: Annotated[int | None, typer.Option(help="Optimiser steps.", show_default=False)] = None,
     batch_size: Annotated[int | None, typer.Option(help="Clips a step.", show_default=False)] = None,
     learning_rate: Annotated[float | None, typer.Option(help="Peak rate.", show_default=False)] = None,
-    seed: Annotated[int | None, typer.Option(help="Weights and batches.", show_default=False)] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="Of first weights and of batches.", show_default=False)
+    ] = None,
     options: Annotated[
         list[str] | None,
         typer.Option(
             "--set",
             metavar="NAME=VALUE",
-            help="Change an option of the stage, its network or its settings: masks=cross; may be repeated.",
+            help="Change an option of the stage, its network or its settings: masks=cross; may be repeated. "
+            "A name that does not exist is answered with the list of all.",
         ),
     ] = None,
     shards: Annotated[
@@ -73,7 +76,9 @@ def train(
         int | None,
         typer.Option(help="End after this many validations without a better score.", show_default=False),
     ] = None,
-    validate_every: Annotated[int | None, typer.Option(help="Steps.", show_default=False)] = None,
+    validate_every: Annotated[
+        int | None, typer.Option(help="Steps between two validations.", show_default=False)
+    ] = None,
     device: Annotated[str, typer.Option(help="Where to train: cpu, cuda, cuda:1, ...")] = "cpu",
     threads: Annotated[
         int | None, typer.Option(help="Threads of torch; by default all.", min=1, show_default=False)

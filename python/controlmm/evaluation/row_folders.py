@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from controlmm.io.atomic import replaced_on_success
+from controlmm.io.settings_changes import settings_changes
 
 ROW_FILE = "row.json"
 _HASH_DIGITS = 24
@@ -46,12 +47,11 @@ def _claim(folder: Path, about: Mapping[str, Any]) -> None:
             before = json.loads(file.read_text(encoding="utf-8"))
         except json.JSONDecodeError:
             before = {}
-        now = json.loads(text)
-        changed = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
-        if changed:
+        changes = settings_changes(before, json.loads(text))
+        if changes:
             raise ValueError(
-                f"{folder} holds an evaluation with another {', '.join(changed)}. Go on with the same "
-                "settings or choose another `--out`."
+                f"{folder} holds an evaluation with other settings: {changes}. Go on with the same ones or "
+                "choose another `--out`."
             )
         return
     folder.mkdir(parents=True, exist_ok=True)

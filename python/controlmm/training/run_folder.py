@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from controlmm.io.settings_changes import settings_changes
 from controlmm.training.settings import TrainingSettings
 
 CHECKPOINT_FILE, LOG_FILE, SETTINGS_FILE = "checkpoint.safetensors", "metrics.jsonl", "run.json"
@@ -43,11 +44,11 @@ class RunFolder:
         file = self.path / SETTINGS_FILE
         if self.has_checkpoint and file.is_file():
             before, now = _with_default_settings(_read_json(file)), json.loads(json.dumps(told))
-            changed = sorted(key for key in before if key not in now or before[key] != now[key])
-            if changed:
+            changes = settings_changes(before, {key: value for key, value in now.items() if key in before})
+            if changes:
                 raise ValueError(
-                    f"{self.path} holds a run with another {', '.join(changed)}. "
-                    "Resume it with the same settings or choose another folder."
+                    f"{self.path} holds a run with other settings: {changes}. "
+                    "Resume it with the same ones or choose another folder."
                 )
             return
         self.path.mkdir(parents=True, exist_ok=True)
