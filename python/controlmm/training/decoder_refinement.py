@@ -26,7 +26,7 @@ from controlmm.motion.normalizer import Normalizer
 from controlmm.nn.conv import DecoderEnds, check_ends
 from controlmm.ops import recover_joints
 from controlmm.training.rvq import POSITION_WEIGHT, reconstruction_errors
-from controlmm.training.settings import TrainingSettings
+from controlmm.training.settings import TINY, TrainingSettings
 from controlmm.training.stage import StageInputs, best_weights, have_same_codes
 from controlmm.training.tokens import near_lengths, tokenize
 from controlmm.training.windows import source_weights
@@ -42,15 +42,7 @@ SETTINGS = {
         validate_every=250,
         checkpoint_every=125,
     ),
-    "tiny": TrainingSettings(
-        steps=20,
-        batch_size=8,
-        learning_rate=1e-3,
-        warmup=2,
-        validate_every=10,
-        checkpoint_every=5,
-        bf16=False,
-    ),
+    "tiny": TINY,
 }
 _LONGEST = 49  # tokens
 

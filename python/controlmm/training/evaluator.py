@@ -13,7 +13,7 @@ from torch.nn.functional import cross_entropy
 from controlmm.models.motion_text_matcher import MatcherConfig, MotionTextMatcher
 from controlmm.motion.normalizer import Normalizer
 from controlmm.training.matching_pairs import PairBatch, PairSampler
-from controlmm.training.settings import TrainingSettings
+from controlmm.training.settings import TINY, TrainingSettings
 from controlmm.training.stage import Stage, StageInputs, by_size
 
 SETTINGS = {
@@ -23,15 +23,7 @@ SETTINGS = {
     "small": TrainingSettings(
         steps=600, batch_size=96, learning_rate=1e-3, warmup=60, weight_decay=0.05, validate_every=100
     ),
-    "tiny": TrainingSettings(
-        steps=20,
-        batch_size=4,
-        learning_rate=1e-3,
-        warmup=2,
-        validate_every=10,
-        checkpoint_every=5,
-        bf16=False,
-    ),
+    "tiny": dataclasses.replace(TINY, batch_size=4),
 }
 SCORED_KINDS = ("annotator", "written", "kinematic")  # sentences of test that hardly occur in train
 _SHARPNESS = 0.14  # times the scalar product (at most 100): a temperature of 0.07 for unit vectors

@@ -15,7 +15,7 @@ from controlmm.nn.trunk import drop_text
 from controlmm.training.corruption import corrupt_tokens
 from controlmm.training.recipe import Recipe
 from controlmm.training.samples import clips_from_text
-from controlmm.training.settings import TrainingSettings
+from controlmm.training.settings import TINY, TrainingSettings
 from controlmm.training.stage import Stage, StageInputs, by_size, load_tokenizer
 from controlmm.training.tokens import TokenBatch, TokenSampler
 
@@ -24,15 +24,7 @@ SETTINGS = {
         steps=180_000, batch_size=64, milestones=(50_000,), weight_decay=1e-5, clip_norm=0.0, bf16=False
     ),
     "small": TrainingSettings(steps=3000, batch_size=64, learning_rate=5e-4, warmup=300, weight_decay=0.01),
-    "tiny": TrainingSettings(
-        steps=20,
-        batch_size=8,
-        learning_rate=1e-3,
-        warmup=2,
-        validate_every=10,
-        checkpoint_every=5,
-        bf16=False,
-    ),
+    "tiny": TINY,
 }
 _VALIDATION_BATCH = 64
 

@@ -19,7 +19,7 @@ from controlmm.motion.normalizer import ROOT_CONTACT_BIAS, Normalizer
 from controlmm.ops import recover_joints
 from controlmm.training.recipe import Recipe
 from controlmm.training.samples import rebuilt_clips
-from controlmm.training.settings import TrainingSettings
+from controlmm.training.settings import TINY, TrainingSettings
 from controlmm.training.stage import Stage, StageInputs, by_size, fit_normalizer
 from controlmm.training.windows import WindowSampler
 
@@ -32,15 +32,7 @@ SETTINGS = {
         steps=400_000, batch_size=256, milestones=(150_000, 250_000), gamma=0.05, clip_norm=0.0, bf16=False
     ),
     "small": TrainingSettings(steps=6000, batch_size=128, learning_rate=6e-4, warmup=200),
-    "tiny": TrainingSettings(
-        steps=20,
-        batch_size=8,
-        learning_rate=1e-3,
-        warmup=2,
-        validate_every=10,
-        checkpoint_every=5,
-        bf16=False,
-    ),
+    "tiny": TINY,
 }
 
 

@@ -46,3 +46,9 @@ class TrainingSettings:
             return self.learning_rate * self.gamma ** sum(step >= milestone for milestone in self.milestones)
         progress = (step - self.warmup) / max(1, self.steps - self.warmup)
         return self.learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(1.0, progress))))
+
+
+# Of stages that need nothing of their own to be tried in seconds.
+TINY = TrainingSettings(
+    steps=20, batch_size=8, learning_rate=1e-3, warmup=2, validate_every=10, checkpoint_every=5, bf16=False
+)

@@ -19,9 +19,8 @@ from controlmm.motion.normalizer import Normalizer
 from controlmm.nn.part_quantizer import PartQuantizer
 from controlmm.nn.trunk import drop_text
 from controlmm.ops import gumbel_straight_through, recover_joints
-from controlmm.training import masked
 from controlmm.training.recipe import Recipe
-from controlmm.training.settings import TrainingSettings
+from controlmm.training.settings import TINY, TrainingSettings
 from controlmm.training.stage import Stage, StageInputs, by_size, load_part_tokenizer
 from controlmm.training.tokens import TokenBatch, TokenSampler
 from controlmm.training.trajectory_masks import Masking, given_coordinates
@@ -44,7 +43,7 @@ SETTINGS = {
         bf16=False,
     ),
     "small": TrainingSettings(steps=2000, batch_size=32, learning_rate=6e-4, warmup=150, weight_decay=0.01),
-    "tiny": masked.SETTINGS["tiny"],
+    "tiny": TINY,
 }
 
 

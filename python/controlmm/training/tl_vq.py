@@ -18,7 +18,7 @@ from controlmm.training import rvq
 from controlmm.training.recipe import Recipe
 from controlmm.training.rvq import reconstruction_errors
 from controlmm.training.samples import rebuilt_clips
-from controlmm.training.settings import TrainingSettings
+from controlmm.training.settings import TINY, TrainingSettings
 from controlmm.training.stage import Stage, StageInputs, by_size, fit_normalizer
 from controlmm.training.windows import PaddedClipSampler, WindowSampler
 
@@ -39,7 +39,7 @@ SETTINGS = {
         bf16=False,
     ),
     "small": TrainingSettings(steps=2400, batch_size=64, learning_rate=6e-4, warmup=200),
-    "tiny": rvq.SETTINGS["tiny"],
+    "tiny": TINY,
 }
 
 
