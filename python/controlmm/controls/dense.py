@@ -100,7 +100,10 @@ def _check_arguments(controls: Sequence[Control], num_frames: int) -> None:
     if isinstance(num_frames, bool) or not isinstance(num_frames, int) or num_frames < 1:
         raise ValueError(f"`num_frames` must be a positive integer, got {num_frames!r}.")
     if not isinstance(controls, Sequence) or isinstance(controls, str):
-        raise TypeError(f"`controls` must be a list of controls, got {type(controls).__name__}.")
+        raise TypeError(
+            f"`controls` must be a list of controls, got {type(controls).__name__}. Put one in brackets; "
+            "of a file take `load_controls(path).controls`."
+        )
     for index, control in enumerate(controls):
         if not isinstance(control, Control):
             raise TypeError(

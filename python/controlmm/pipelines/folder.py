@@ -68,7 +68,7 @@ def read_pipeline(folder: Path, kind: str) -> dict[str, Any]:
     if about.get("kind") != kind or about.get("format") != FORMAT:
         raise ValueError(
             f"{folder} holds a pipeline of kind {about.get('kind')!r}, format {about.get('format')!r}; "
-            f"expected {kind!r}, format {FORMAT}."
+            f"expected {kind!r}, format {FORMAT}. `controlmm.pipelines.load_pipeline` opens every kind."
         )
     return about
 
