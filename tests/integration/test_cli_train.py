@@ -140,6 +140,18 @@ def test_missing_folders_are_named(
     assert not (tmp_path / "out").exists()
 
 
+def test_a_model_is_not_mixed_with_stages_or_with_an_earlier_model(
+    root: Path, refused: Command, tmp_path: Path
+) -> None:
+    before = sorted(root.rglob("*"))
+    assert "`--out` must not be the folder of the stages" in refused("assemble", root, "--out", root)
+    assert sorted(root.rglob("*")) == before
+    (tmp_path / "model" / "length").mkdir(parents=True)
+    message = refused("assemble", root, "--out", tmp_path / "model")
+    assert f"{tmp_path / 'model' / 'length'} is of an earlier model" in message
+    assert [path.name for path in (tmp_path / "model").iterdir()] == ["length"]
+
+
 def test_a_stage_asks_for_the_one_before(data: Path, refused: Command, tmp_path: Path) -> None:
     arguments = ("--data", data, "--config", "tiny", "--text", "hashing", "--out", tmp_path, "--quiet")
     assert "Run `controlmm train rvq` with the same --out first" in refused("train", "masked", *arguments)

@@ -40,8 +40,11 @@ def assemble(
         raise FileNotFoundError(
             f"No trained stage in {root}. Pass the folder that `controlmm train STAGE --out` wrote to."
         )
+    if out.resolve() == root.resolve():
+        raise ValueError("`--out` must not be the folder of the stages, whose files it would mix with its own.")
     encoder = _text_encoder(root, text, text_folder)
     pipeline, stages = (_tlcontrol if (root / "tl-mtt").is_dir() else _controlmm)(root, encoder)
+    _check_nothing_stale(out, pipeline)
     pipeline.save_pretrained(out, dtype=torch.float16 if half else torch.float32)
     for network, stage in stages.items():
         if (root / stage / SETTINGS_FILE).is_file():  # not there when a stage came from a model without it
@@ -49,6 +52,16 @@ def assemble(
     size = sum(file.stat().st_size for file in out.rglob("*") if file.is_file()) / 1e6
     typer.echo(f"{out}: {size:.1f} MB, {pipeline.num_parameters / 1e6:.2f} million parameters")
     typer.echo(f'Next: controlmm generate "a person walks forward" --model {out}')
+
+
+def _check_nothing_stale(out: Path, pipeline: MotionPipeline[Any]) -> None:
+    """A network that an earlier model left in the folder would be loaded with this one."""
+    for name in pipeline.optional_networks:
+        if (out / name).is_dir() and name not in pipeline.networks():
+            raise ValueError(
+                f"{out / name} is of an earlier model and would be loaded with this one, which has none. "
+                "Delete it, or choose another `--out`."
+            )
 
 
 def _controlmm(root: Path, encoder: TextEncoder) -> tuple[MotionPipeline[Any], dict[str, str]]:
