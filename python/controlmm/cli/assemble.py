@@ -41,7 +41,7 @@ def assemble(
             f"No trained stage in {root}. Pass the folder that `controlmm train STAGE --out` wrote to."
         )
     if out.resolve() == root.resolve():
-        raise ValueError("`--out` must not be the folder of the stages, whose files it would mix with its own.")
+        raise ValueError("`--out` must not be the folder of the stages: their files would mix.")
     encoder = _text_encoder(root, text, text_folder)
     pipeline, stages = (_tlcontrol if (root / "tl-mtt").is_dir() else _controlmm)(root, encoder)
     _check_nothing_stale(out, pipeline)
