@@ -24,6 +24,7 @@ HOME = {
     "EditingBudget": "controlmm.generation.editing",
     "MaskedOptions": "controlmm.training.masked",
     "MaskedTransformerConfig": "controlmm.models.masked_transformer",
+    "PartVqVaeConfig": "controlmm.models.part_vq_vae",
     "Preset": "controlmm.pipelines.presets",
     "ResidualTransformerConfig": "controlmm.models.residual_transformer",
     "RvqOptions": "controlmm.training.rvq",
