@@ -353,6 +353,16 @@ def test_a_motion_is_edited_under_the_controls_and_obstacles_of_files(
     assert (tmp_path / "he-walks-on_0_0.glb").read_bytes()[:4] == b"glTF"
 
 
+def test_clips_go_on_from_each_other(command: Command, tiny_pipeline_folder: Path, tmp_path: Path) -> None:
+    command(
+        "generate", PROMPT, "--seconds", 2, "--then", "he bows: 2.5", "--then", "time 3:00, he waves:2",
+        "--preset", "fast", "--formats", "npz", "--out", tmp_path, "--model", tiny_pipeline_folder,
+    )  # fmt: skip
+    motion = Motion.load(tmp_path / "a-person-walks-forward_0_0.npz")
+    assert motion.num_frames == 40 + 50 + 40 - 2 * 16  # neighbours share 0.8 s
+    assert motion.text == f"{PROMPT}; he bows; time 3:00, he waves"
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -375,6 +385,14 @@ def test_a_motion_is_edited_under_the_controls_and_obstacles_of_files(
         (("--method", "passes"), "`--method` is for timelines. Name one with `--timeline FILE`."),
         (("--timeline", "line.json"), 'line.json holds no timeline. Give it as "timeline": [...]'),
         (("--timeline", "t.json", "--seconds", "2"), "`--timeline` and `--seconds` do not go together."),
+        (("--then", "he bows:3"), "`--then` goes on from a first clip. Say how long that lasts, with"),
+        (
+            ("--then", "he bows 3", "--seconds", "3"),
+            "`--then` must be PROMPT:SECONDS, such as 'a person sits down:3', got 'he bows 3'.",
+        ),
+        (("--then", "he bows:3", "--controls", "line.json"), "`--then` and `--controls` do not go together."),
+        (("--then", "he bows:3", "--edit", "a.npz"), "`--edit` and `--then` do not go together."),
+        (("--then", "he bows:1", "--seconds", "3"), "`clips[1]` must last more than twice the overlap"),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(

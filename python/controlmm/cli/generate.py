@@ -49,6 +49,10 @@ def generate(
         str | None,
         typer.Option(help="How a timeline is made: tracks, passes or published.", show_default="tracks"),
     ] = None,
+    then: Annotated[
+        list[str] | None,
+        typer.Option(help="PROMPT:SECONDS of a clip that goes on from there; repeat for a long motion."),
+    ] = None,
     edit: Annotated[
         Path | None, typer.Option(help="Motion to change: .npz, .npy or .bvh; see --keep and --keep-part.")
     ] = None,
@@ -117,6 +121,7 @@ def generate(
     """Generate motions and print how well each of them meets its controls."""
     from controlmm.cli.scene_options import (
         all_obstacles,
+        chained_clips,
         check_same_length,
         check_together,
         parse_interval,
@@ -133,7 +138,7 @@ def generate(
     entries = timeline_entries(document, timeline)
     check_together(
         edit=edit, has_timeline=bool(entries), keep=keep, keep_part=keep_part, loose=loose, controls=controls,
-        obstacles=obstacles, seconds=seconds, vary=vary, method=method,
+        obstacles=obstacles, seconds=seconds, vary=vary, method=method, then=then,
     )  # fmt: skip
     avoided = all_obstacles(document, obstacles)
     if entries and prompt is not None:
@@ -146,6 +151,7 @@ def generate(
         check_same_length(document, source)
     seconds = None if entries or source else _chosen_seconds(seconds, document, controls)
     intervals = [parse_interval(text) for text in keep or ()]
+    clips = chained_clips(prompt, seconds, then or ())
 
     from controlmm.pipelines import ControlMM, TLControl, load_pipeline
 
@@ -164,6 +170,8 @@ def generate(
         if entries:
             options |= {} if method is None else {"method": method}
             result = pipeline.timeline(entries, controls=held, obstacles=avoided, **options)
+        elif clips:
+            result = pipeline.chain(clips, **options)
         elif source is not None:
             assert isinstance(pipeline, ControlMM | TLControl)
             result = pipeline.edit(

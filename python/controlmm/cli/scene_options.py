@@ -1,7 +1,8 @@
-"""Options of ``controlmm generate`` that name files with obstacles, timelines and motions to edit."""
+"""Options of ``controlmm generate`` beside a prompt: obstacles, timelines, chains, motions to edit."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -49,6 +50,28 @@ def timeline_entries(document: ControlFile | None, path: Path | None) -> tuple[T
     return entries
 
 
+def chained_clips(prompt: str, seconds: float | None, then: Sequence[str]) -> list[tuple[str, float]]:
+    """(prompt, seconds) of the first clip and of those that go on from it; none without ``then``.
+
+    Raises:
+        ValueError: If a clip has no length.
+    """
+    if not then:
+        return []
+    if seconds is None:
+        raise ValueError("`--then` goes on from a first clip. Say how long that lasts, with `--seconds`.")
+    clips = [(prompt, seconds)]
+    for text in then:
+        words, _, length = text.rpartition(":")
+        try:
+            clips.append((words.strip(), float(length)))
+        except ValueError:
+            raise ValueError(
+                f"`--then` must be PROMPT:SECONDS, such as 'a person sits down:3', got {text!r}."
+            ) from None
+    return clips
+
+
 def parse_interval(text: str) -> tuple[float, float]:
     """Start and end in seconds of an interval such as ``0-2.5``.
 
@@ -93,9 +116,14 @@ def check_together(*, edit: Path | None, has_timeline: bool, **others: object) -
             "`--timeline` and `--edit` do not go together. Edit what a timeline made in a second call."
         )
     for first, is_there, allowed in (
+        ("--then", bool(others.get("then")), {"then", "seconds"}),
         ("--edit", edit is not None, {"keep", "keep-part", "loose", "controls", "obstacles"}),
         ("--timeline", has_timeline, {"controls", "obstacles", "method"}),
-        ("--controls", edit is None and not has_timeline, {"controls", "obstacles", "seconds", "vary"}),
+        (
+            "--controls",
+            edit is None and not has_timeline,
+            {"controls", "obstacles", "seconds", "vary", "then"},
+        ),
     ):
         if is_there and given - allowed:
             name = sorted(given - allowed)[0]
