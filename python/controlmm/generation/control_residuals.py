@@ -149,6 +149,12 @@ class ControlResiduals:
         )
 
     @property
+    def coordinates(self) -> list[int]:
+        """How many each clip controls."""
+        counts: list[int] = self._controlled.flatten(1).sum(1).tolist()
+        return counts
+
+    @property
     def spread(self) -> CodeSpread:
         """The unit of the latents' steps."""
         return self.decoder.spread()

@@ -40,7 +40,7 @@ class NaturalWeights:
 
     nearness: float = 0.005
     steadiness: float = 2.0
-    feet: float = 10.0
+    feet: float = 40.0
     floor: float = 10.0
 
     def __post_init__(self) -> None:

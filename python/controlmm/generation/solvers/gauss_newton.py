@@ -22,7 +22,7 @@ from controlmm.generation.one_thread import one_thread
 from controlmm.generation.solvers.clip_search import ClipRecord, Progress, report, solution_of
 from controlmm.generation.solvers.curvature import Curvature
 from controlmm.generation.solvers.metric import Metric
-from controlmm.generation.solvers.natural_way import STEPS, NaturalWay
+from controlmm.generation.solvers.natural_way import NaturalWay, natural_steps
 from controlmm.generation.solvers.stopping import Reason, Solution, Stopping, Watch
 
 _EARLY_RENEWALS, _STEPS_OF_A_METRIC = (2, 5), 10  # steps after which a metric may be made anew
@@ -52,7 +52,10 @@ def gauss_newton(
     """
     latents = latents.detach()
     records = [ClipRecord(clip, kept, residuals.spread) for clip, kept in zip(latents, keep, strict=True)]
-    descents = [_Descent(record.start, residuals, stopping.iterations) for record in records]
+    descents = [
+        _Descent(record.start, residuals, stopping.iterations, coordinates=count)
+        for record, count in zip(records, residuals.coordinates, strict=True)
+    ]
     watch = Watch(stopping)
     selected, active = residuals, list(range(len(records)))
     while active:
@@ -82,7 +85,12 @@ class _Descent:
     """The way of one clip: asks for ``point``, sees what is there, turns by the gradient."""
 
     def __init__(
-        self, start: Float[Tensor, "N"], residuals: ControlResiduals, iterations: int | None
+        self,
+        start: Float[Tensor, "N"],
+        residuals: ControlResiduals,
+        iterations: int | None,
+        *,
+        coordinates: int,
     ) -> None:
         self.point = start
         self.reason: Reason | None = None
@@ -95,10 +103,10 @@ class _Descent:
         self._gradient: Tensor | None = None
         self._halvings = 0
         self._push = 0.0  # squared length of the step that the residual alone asks for
-        natural, steps = residuals.naturalness, STEPS if iterations is None else min(STEPS, iterations // 2)
         self._natural: NaturalWay | None = None
-        if natural is not None:
-            self._natural = NaturalWay(start, nearness=natural.weights.nearness, steps=steps)
+        if residuals.naturalness is not None:
+            nearness, steps = residuals.naturalness.weights.nearness, natural_steps(coordinates, iterations)
+            self._natural = NaturalWay(start, nearness=nearness, steps=steps)
 
     @property
     def is_natural(self) -> bool:

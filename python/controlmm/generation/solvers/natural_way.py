@@ -14,8 +14,18 @@ from torch import Tensor
 
 from controlmm.generation.control_residuals import Probe
 
-STEPS = 15  # of the natural part; later ones improved little on validation clips
+_FEW = 45  # coordinates: a pose of fifteen joints, a joint at fifteen keyframes
+_STEPS_OF_FEW, _STEPS = 5, 15  # of the natural part; later ones improved little on validation clips
 _BALANCED = 0.1  # squared gradient below this share of what the residual would push with when alone
+
+
+def natural_steps(coordinates: int, iterations: int | None) -> int:
+    """Steps of the natural part towards so many controlled coordinates, at most half of all ``iterations``.
+
+    A few targets hardly fight with the feet.
+    """
+    steps = _STEPS if coordinates > _FEW else _STEPS_OF_FEW
+    return steps if iterations is None else min(steps, iterations // 2)
 
 
 class NaturalWay:
