@@ -195,6 +195,19 @@ def test_lbfgs_stops_where_the_gradient_vanishes():
     assert lbfgs(bowl, start, everywhere(start), Stopping(iterations=9)).reasons == ("converged",)
 
 
+def test_lbfgs_sets_out_on_a_bowl_so_flat_that_its_usual_first_trial_drowns_in_rounding():
+    """By PyTorch's rule that trial changes the loss by 2e-8 of itself, less than float32 can tell."""
+    start = torch.zeros(1, 4, 8)
+    bowl = Bowl(1 + random(1, 4, 8).abs(), 1e-8 * (1 + random(1, 4, 8, seed=1).abs()))
+    call = (bowl, start, everywhere(start), Stopping(iterations=40))
+    endless = LbfgsTolerance(gradient=0.0, change=1e-30)
+    stuck = lbfgs(*call, tolerance=endless)
+    assert stuck.reasons == ("converged",)
+    assert stuck.losses[0].min() > 0.99 * stuck.losses[0][0]
+    found = lbfgs(*call, tolerance=endless, first_reach=0.1)
+    assert found.losses[0].min() < 1e-6 * found.losses[0][0]
+
+
 def test_a_clips_lbfgs_does_not_depend_on_the_clips_beside_it():
     """Bitwise, since the objective's numbers do not: every clip has its own line search and memory."""
     start = torch.cat([torch.tensor([[[-1.2, 1.0]]]), 3 * random(4, 1, 2)])

@@ -25,6 +25,7 @@ from controlmm.generation.solvers import (
 _LBFGS_STEPS = 4  # for each step of Gauss-Newton, which costs as much and looks further ahead
 _NATURAL_SHARE = 0.4  # of the steps of L-BFGS
 _MILLIMETRE = 1e-3  # metres
+_FIRST_REACH = 0.1  # of the first trial of L-BFGS, in standard deviations of the base codes
 
 
 def edit_latents(
@@ -83,7 +84,13 @@ def _lbfgs(
     progress: Progress | None,
 ) -> Solution:
     """The first part of the way is natural; what is then left of the error goes the shortest way."""
-    search = partial(lbfgs, keep=keep, tolerance=_square_millimetres(plain), progress=progress)
+    search = partial(
+        lbfgs,
+        keep=keep,
+        tolerance=_square_millimetres(plain),
+        first_reach=_FIRST_REACH * plain.decoder.code_deviation(),
+        progress=progress,
+    )
     if natural is plain or stopping.iterations is None:
         return search(natural, latents, stopping=stopping)
     steps = round(_NATURAL_SHARE * stopping.iterations)

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from controlmm.generation.objective import Objective
-from controlmm.generation.solvers.clip_search import Progress, Search, run_searches
+from controlmm.generation.solvers.clip_search import Progress, Sample, Search, run_searches
 from controlmm.generation.solvers.curvature import Curvature
 from controlmm.generation.solvers.line_search import Line, strong_wolfe
 from controlmm.generation.solvers.stopping import Reason, Solution, Stopping
@@ -44,6 +44,7 @@ def lbfgs(
     rate: float = 1.0,
     history: int = 200,
     tolerance: LbfgsTolerance | None = None,
+    first_reach: float | None = None,
     progress: Progress | None = None,
 ) -> Solution:
     """Latents that minimise the objective; each clip keeps its best iterate.
@@ -59,6 +60,8 @@ def lbfgs(
             TLControl's is 0.1.
         history: Pairs to remember; each costs two vectors as long as the latents of a clip.
         tolerance: When to stop for want of progress.
+        first_reach: By how much the very first trial changes the entry that it changes most; ``None`` is
+            PyTorch's rule, whose trial is lost in rounding where gradients are small.
         progress: Called after every evaluation.
     """
     steps: list[int] = []
@@ -69,6 +72,7 @@ def lbfgs(
         rate=rate,
         history=history,
         tolerance=tolerance or LbfgsTolerance(),
+        first_reach=first_reach,
     )
     solution = run_searches(search, objective, latents, keep, stopping, progress=progress)
     return dataclasses.replace(solution, iterations=torch.tensor(steps, dtype=torch.int64))
@@ -82,6 +86,7 @@ def _search(
     rate: float,
     history: int,
     tolerance: LbfgsTolerance,
+    first_reach: float | None,
 ) -> Search:
     """The search of the next clip; how many steps it has taken stands in a new place of ``steps``."""
     converged: Reason = "converged"
@@ -91,7 +96,7 @@ def _search(
     sample = yield point
     if sample.gradient.abs().max() <= tolerance.gradient:
         return converged
-    step = min(1.0, 1 / sample.gradient.abs().sum().item()) * rate
+    step = _first_step(sample, rate, first_reach)
     while iterations is None or steps[clip] < iterations:
         direction = memory.direction(sample.gradient)
         line = Line(point, direction, sample)
@@ -111,3 +116,9 @@ def _search(
         step = rate
     reason: Reason = "iterations"
     return reason
+
+
+def _first_step(sample: Sample, rate: float, reach: float | None) -> float:
+    if reach is None:
+        return min(1.0, 1 / sample.gradient.abs().sum().item()) * rate
+    return reach / sample.gradient.abs().max().item()
