@@ -106,8 +106,12 @@ def test_an_error_of_the_callback_ends_all():
 
 
 def test_ctrl_c_ends_all():
-    with pytest.raises(KeyboardInterrupt):
-        run(endless, endless, lambda _: os.kill(os.getpid(), signal.SIGINT))
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # shells' background jobs ignore it
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run(endless, endless, lambda _: os.kill(os.getpid(), signal.SIGINT))
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_progress_is_called_by_the_caller_only_and_never_goes_back():
