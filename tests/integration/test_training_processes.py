@@ -13,7 +13,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from controlmm.cli import main
+import controlmm
 from controlmm.nn.quantizer import EmaCodebook
 from controlmm.training.processes import Processes, device_of_process
 
@@ -34,7 +34,7 @@ def in_two_processes(*command: str) -> None:
     started = subprocess.run(
         [
             sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2",
-            "--module", main.__name__, *command,
+            "--module", controlmm.__name__, *command,
         ],
         env={**os.environ, "OMP_NUM_THREADS": "1"}, timeout=PATIENCE, capture_output=True, text=True,
         check=False,
