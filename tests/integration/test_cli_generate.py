@@ -353,16 +353,6 @@ def test_a_motion_is_edited_under_the_controls_and_obstacles_of_files(
     assert (tmp_path / "he-walks-on_0_0.glb").read_bytes()[:4] == b"glTF"
 
 
-def test_clips_go_on_from_each_other(command: Command, tiny_pipeline_folder: Path, tmp_path: Path) -> None:
-    command(
-        "generate", PROMPT, "--seconds", 2, "--then", "he bows: 2.5", "--then", "time 3:00, he waves:2",
-        "--preset", "fast", "--formats", "npz", "--out", tmp_path, "--model", tiny_pipeline_folder,
-    )  # fmt: skip
-    motion = Motion.load(tmp_path / "a-person-walks-forward_0_0.npz")
-    assert motion.num_frames == 40 + 50 + 40 - 2 * 16  # neighbours share 0.8 s
-    assert motion.text == f"{PROMPT}; he bows; time 3:00, he waves"
-
-
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
