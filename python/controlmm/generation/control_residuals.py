@@ -189,6 +189,13 @@ class ControlResiduals:
         (features,) = torch.autograd.grad(outputs, self._features, slopes, retain_graph=True)
         return self.part.pull(self._decoded, features)
 
+    def jacobian(self, clip: int, probe: Probe) -> Float[Tensor, "N L C"]:
+        """Gradients of each of a clip's residuals at the latest probe, of which ``probe`` is its part."""
+        rows = probe.rows(None).dense().float()
+        if self._held is not None:
+            rows[:, : self._held.shape[1]] = 0
+        return self.part.pull_rows(self._decoded, clip, rows, [self.channels[i] for i in probe.columns])
+
 
 def _channels_of(joints: Sequence[int]) -> list[int]:
     """The root's channels and those of the other joints' positions, for joints that begin with the pelvis."""

@@ -34,6 +34,17 @@ class Tape:
         blocks = tuple((inner[clips], hidden[clips]) for inner, hidden in self.blocks)
         return Tape(self.channels, (), self.entry[clips], blocks, self.smooth[clips])
 
+    def of_clip(self, clip: int, *, channels: Sequence[int], rows: int) -> Tape:
+        """The tape of one of the clips that lie end to end, seen by some channels, ``rows`` times over."""
+        first, length = sum(self.lengths[:clip]), self.lengths[clip]
+
+        def own(x: Tensor) -> Tensor:
+            scale = x.shape[1] // self.entry.shape[1]
+            return x[:, scale * first : scale * (first + length)].expand(rows, -1, -1)
+
+        blocks = tuple((own(inner), own(hidden)) for inner, hidden in self.blocks)
+        return Tape(tuple(channels), (), own(self.entry), blocks, own(self.smooth))
+
 
 class _Block:
     def __init__(self, block: ResidualConvBlock, dtype: torch.dtype) -> None:

@@ -26,6 +26,11 @@ class KinematicRows:
     root: Float[Tensor, "N 3 T"]
     local: Tensor
 
+    def dense(self) -> Float[Tensor, "N T D"]:
+        """All rows in full."""
+        count, frames = len(self.root), self.root.shape[2]
+        return torch.cat([self.root, self.local.to_dense().view(count, -1, frames)], dim=1).mT
+
     def gram(self, channels: Float[Tensor, "D T D T"]) -> Float[Tensor, "N N"]:
         """``K G K^T`` for the channels' own ``G``."""
         frames = channels.shape[1]

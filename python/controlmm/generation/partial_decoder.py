@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import pad
 
 from controlmm.generation.clip_groups import clips_end_to_end
 from controlmm.generation.frozen_decoder import FrozenDecoder, Tape
@@ -95,3 +96,15 @@ class PartialDecoder:
         for group, part in zip(self.groups, pulled, strict=True):
             latents.flatten(0, 1)[group.tokens] = part[0]
         return latents
+
+    def pull_rows(
+        self, decoded: Decoded, clip: int, rows: Float[Tensor, "N T D"], channels: Sequence[int]
+    ) -> Float[Tensor, "N L C"]:
+        """As :meth:`pull` for one clip: many gradients, of its own frames in some channels of the decoder."""
+        for group, tape in zip(self.groups, decoded.tapes, strict=True):
+            if clip in group.clips:
+                own = tape.of_clip(group.clips.index(clip), channels=channels, rows=len(rows))
+                pulled = self._frozen.pull(own, rows)
+                missing = self.frames.shape[1] // self.decoder.downsample - pulled.shape[1]
+                return pad(pulled, (0, 0, 0, missing))
+        raise IndexError(f"there is no clip {clip}")

@@ -21,6 +21,7 @@ from controlmm.generation.coordinate_groups import Groups
 from controlmm.generation.one_thread import one_thread
 from controlmm.generation.solvers.clip_search import ClipRecord, Progress, report, solution_of
 from controlmm.generation.solvers.curvature import Curvature
+from controlmm.generation.solvers.known_rows import MOST_ROWS, KnownRows, ShortestWay
 from controlmm.generation.solvers.metric import Metric
 from controlmm.generation.solvers.natural_way import NaturalWay, natural_steps
 from controlmm.generation.solvers.stopping import Reason, Solution, Stopping, Watch
@@ -61,11 +62,15 @@ def gauss_newton(
     while active:
         points = [records[row].placed(descents[row].point, latents[row]) for row in active]
         wanted: list[Tensor | None] = []
-        for row, probe in zip(active, selected.probe(torch.stack(points)), strict=True):
+        probes = selected.probe(torch.stack(points))
+        for place, (row, probe) in enumerate(zip(active, probes, strict=True)):
             record, descent = records[row], descents[row]
             error = (3 * probe.loss) ** 0.5
             record.judge(descent.point, probe.loss, error)
             record.reason = watch.verdict(loss=probe.loss, error=error, evaluations=len(record.losses))
+            if record.reason is None and descent.asks_for_rows:
+                rows = selected.jacobian(place, probe)
+                descent.know(torch.stack([record.gradient(gradient) for gradient in rows]))
             wanted.append(descent.see(probe) if record.reason is None else None)
         if any(weights is not None for weights in wanted):
             gradients = selected.pull(wanted, strained=[descents[row].is_natural for row in active])
@@ -97,7 +102,11 @@ class _Descent:
         self._origin, self._direction, self._step = start, torch.zeros_like(start), 1.0
         self._residuals, self._iterations, self._done = residuals, iterations, -1
         self._memory = Curvature(_HISTORY)
-        self._metric: Metric | None = None
+        self._metric: Metric | KnownRows | None = None
+        self._shortest: ShortestWay | None = None
+        self.asks_for_rows = 0 < coordinates <= MOST_ROWS
+        self._residual: Tensor | None = None
+        self._is_lost = False
         self._way = start.new_zeros(0, 3)
         self._value, self._slope = math.inf, 0.0
         self._gradient: Tensor | None = None
@@ -114,18 +123,27 @@ class _Descent:
         return self._natural is not None
 
     @one_thread()
+    def know(self, rows: Float[Tensor, "R N"]) -> None:
+        """The clip's own Jacobian at the start."""
+        self._metric, self.asks_for_rows = KnownRows(rows), False
+
+    @one_thread()
     def see(self, probe: Probe) -> Float[Tensor, "N"] | None:
-        """Weights of the gradient wanted here; ``None`` if the point is refused for a nearer one."""
+        """Weights of the gradient wanted here; ``None`` if the next point needs none."""
+        if self._shortest is not None:
+            self._follow(self._shortest, probe)
+            return None
         if self._metric is None:
             self._renew(probe)
         assert self._metric is not None
         value, weights = self._weigh(probe)
+        if isinstance(self._metric, KnownRows) and self._residual is not None:
+            self._metric.remember(self.point - self._origin, probe.residual - self._residual)
         if not value <= self._value + _SUFFICIENT_DECREASE * self._step * self._slope:
             self._shorten(value)
             return None
-        self._done += 1
-        is_due = self._done in _EARLY_RENEWALS or (self._done and self._done % _STEPS_OF_A_METRIC == 0)
-        if is_due and (_way(probe) - self._way).abs().max() > _STALE:
+        self._done, self._residual = self._done + 1, probe.residual
+        if self._is_stale(probe):
             self._renew(probe)
             value, weights = self._weigh(probe)
         if self._natural is not None and self._natural.ends(self._done):
@@ -134,10 +152,26 @@ class _Descent:
         elif self._natural is not None and self._natural.shift(probe.residual):
             value, weights = self._weigh(probe)
             self._gradient = None
+        if self._natural is None and isinstance(self._metric, KnownRows) and not self._is_lost:
+            self._shortest = ShortestWay(self._metric, self.point, probe)
+            self.point = self._shortest.next()
+            return None
         self._value = value
         if self._natural is not None:
             self._push = 2 * self._metric.weigh(probe.residual)[0]
         return weights
+
+    def _follow(self, way: ShortestWay, probe: Probe) -> None:
+        """A step by known rows; where they lead nowhere, the way goes on as with many coordinates."""
+        self._done += 1
+        goes_on = way.see(self.point, probe)
+        if self._iterations is not None and self._done >= self._iterations:
+            self.reason = "iterations"
+        elif goes_on:
+            self.point = way.next()
+        else:
+            self._shortest, self._is_lost = None, True
+            self._value, self.point = math.inf, way.best
 
     def _weigh(self, probe: Probe) -> tuple[float, Float[Tensor, "N"]]:
         """What is minimised, and the weights of the residual in its gradient."""
@@ -177,8 +211,17 @@ class _Descent:
 
     def _go_straight(self) -> None:
         """From here on targets alone count."""
+        if isinstance(self._metric, KnownRows):
+            self._metric.bend(self._memory)
         self._natural, self._gradient = None, None
         self._memory.clear()
+
+    def _is_stale(self, probe: Probe) -> bool:
+        """Whether an average metric should be made anew: by and by, if the root has moved."""
+        is_due = self._done in _EARLY_RENEWALS or (self._done and self._done % _STEPS_OF_A_METRIC == 0)
+        if not is_due or isinstance(self._metric, KnownRows):
+            return False
+        return bool((_way(probe) - self._way).abs().max() > _STALE)
 
     def _renew(self, probe: Probe) -> None:
         """The metric of the clip as it now is; gradients of the old one cannot be compared with new ones."""

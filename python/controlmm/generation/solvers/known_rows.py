@@ -1,0 +1,87 @@
+"""A clip's own Jacobian, for so few controlled coordinates that each may have a pass back.
+
+The passes go through the decoder together and share its weights: a row costs a fifth of an evaluation.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from controlmm.generation.control_residuals import Probe
+from controlmm.generation.solvers.curvature import Curvature
+
+MOST_ROWS = 18  # six joints in one frame, one joint in six: more rows cost more evaluations than they save
+# Times the mean of the diagonal of J J^T: of the metric, which coordinates that nothing moves must not
+# outweigh, and of the steps by rows.
+_DAMPING, _DAMPING_OF_STEPS = 0.03, 1e-3
+_PROGRESS, _FAILURES = 0.5, 2  # after so many steps that leave more than half, rows are not worth following
+
+
+class KnownRows:
+    """The metric ``M = (J J^T + damping)^-1``, as :class:`Metric`, for the Jacobian of the clip itself.
+
+    Args:
+        rows: (N, U) gradients of the residual's coordinates in the unknowns.
+    """
+
+    def __init__(self, rows: Float[Tensor, "N U"]) -> None:
+        self._rows, self._ways = rows, rows
+        self._seen: list[tuple[Tensor, Tensor]] = []
+        self._inverse = torch.cholesky_inverse(torch.linalg.cholesky(self._products(_DAMPING)))
+
+    def weigh(self, residual: Float[Tensor, "N"]) -> tuple[float, Float[Tensor, "N"]]:
+        """``r^T M r / 2`` and ``M r``."""
+        weights = self._inverse @ residual
+        return 0.5 * (residual @ weights).item(), weights
+
+    def remember(self, step: Float[Tensor, "U"], change: Float[Tensor, "N"]) -> None:
+        """What a step changed of the residual, for :meth:`learn`; the metric stays as it is."""
+        self._seen.append((step, change))
+
+    def learn(self) -> None:
+        """Correct the rows by what was seen (Broyden's update: Nocedal and Wright, chapter 11.1)."""
+        for step, change in self._seen:
+            length = (step @ step).item()
+            if length > 0:
+                surprise = change.float() - self._rows @ step
+                self._rows = self._rows.addr(surprise / length, step)
+        self._seen.clear()
+
+    def bend(self, memory: Curvature) -> None:
+        """From here on steps are shortest where ``memory``, of the natural part, says that it is stiff."""
+        self._ways = torch.stack([-memory.direction(row) for row in self._rows])
+
+    def step(self, residual: Float[Tensor, "N"]) -> Float[Tensor, "U"]:
+        """The shortest step that removes the residual, up to damping."""
+        weights, _ = torch.linalg.solve_ex(self._products(_DAMPING_OF_STEPS), residual)
+        step: Tensor = -weights.float() @ self._ways
+        return step
+
+    def _products(self, damping: float) -> Float[Tensor, "N N"]:
+        products = self._rows.double() @ self._ways.double().T
+        diagonal = products.diagonal()
+        diagonal += damping * diagonal.mean() + torch.finfo(torch.float32).tiny
+        return products
+
+
+class ShortestWay:
+    """The end of a clip's way by known rows: passes forward only, each of which corrects the rows."""
+
+    def __init__(self, rows: KnownRows, point: Float[Tensor, "U"], probe: Probe) -> None:
+        self.best, self._rows = point, rows
+        self._residual, self._loss, self._failures = probe.residual, probe.loss, 0
+
+    def see(self, point: Float[Tensor, "U"], probe: Probe) -> bool:
+        """Take the point if it is better; says whether to go on."""
+        self._rows.remember(point - self.best, probe.residual - self._residual)
+        self._failures += not probe.loss < _PROGRESS * self._loss
+        if probe.loss < self._loss:
+            self.best, self._residual, self._loss = point, probe.residual, probe.loss
+        return self._failures < _FAILURES
+
+    def next(self) -> Float[Tensor, "U"]:
+        """Where to go."""
+        self._rows.learn()
+        return self.best + self._rows.step(self._residual)
