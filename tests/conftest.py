@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -26,6 +27,14 @@ from controlmm.text.hashing import HashingTextEncoder
 STRIDE = 22  # frames of two steps
 DECIDED = 30.0  # times fresh weights: logits as peaked and texts as audible as after training
 SMALLEST_STD = 0.01  # of a synthetic channel: a walk hardly moves some of them
+
+
+def pytest_configure() -> None:
+    """Where several processes share the tests, each takes its part of the processor, and its commands too."""
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "0"))
+    if workers:
+        torch.set_num_threads(max(1, torch.get_num_threads() // workers))
+        os.environ.setdefault("OMP_NUM_THREADS", str(torch.get_num_threads()))
 
 
 @pytest.fixture(scope="session")
