@@ -143,3 +143,19 @@ def test_targets_that_rows_cannot_reach_do_not_stop_the_others(scene):
     joints = scene.decoder(solution.latents, scene.frames)
     assert (joints[:, 12, 0, 0] - targets[:, 12, 0, 0]).abs().max() < 1e-3
     assert solution.evaluations.max() <= 40
+
+
+@pytest.mark.parametrize("iterations", [0, 1, 3])
+@pytest.mark.parametrize("is_natural", [False, True])
+def test_no_more_steps_than_allowed(scene, iterations, is_natural):
+    natural = None
+    if is_natural:
+        natural = Naturalness.of_start(
+            scene.decoder, scene.latents, scene.mask, scene.frames, NaturalWeights()
+        )
+    residuals = ControlResiduals(scene.decoder, scene.targets, scene.mask, scene.frames, naturalness=natural)
+    solution = gauss_newton(residuals, scene.latents, scene.keep, Stopping(iterations=iterations))
+    assert (solution.evaluations >= 1).all()
+    if iterations <= 1:  # later, a step may take several trials
+        assert solution.evaluations.max() <= iterations + 1
+    assert all(losses.min() <= losses[0] for losses in solution.losses)

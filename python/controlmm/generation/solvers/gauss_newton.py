@@ -11,6 +11,7 @@ Lengths of steps are measured in standard deviations of the codes (``code_spread
 from __future__ import annotations
 
 import math
+from typing import TypeGuard
 
 import torch
 from jaxtyping import Float
@@ -137,7 +138,7 @@ class _Descent:
             self._renew(probe)
         assert self._metric is not None
         value, weights = self._weigh(probe)
-        if isinstance(self._metric, KnownRows) and self._residual is not None:
+        if self._residual is not None and self._knows(self._metric):
             self._metric.remember(self.point - self._origin, probe.residual - self._residual)
         if not value <= self._value + _SUFFICIENT_DECREASE * self._step * self._slope:
             self._shorten(value)
@@ -152,9 +153,9 @@ class _Descent:
         elif self._natural is not None and self._natural.shift(probe.residual):
             value, weights = self._weigh(probe)
             self._gradient = None
-        if self._natural is None and isinstance(self._metric, KnownRows) and not self._is_lost:
+        if self._natural is None and self._knows(self._metric):
             self._shortest = ShortestWay(self._metric, self.point, probe)
-            self.point = self._shortest.next()
+            self._go_by(self._shortest)
             return None
         self._value = value
         if self._natural is not None:
@@ -164,14 +165,21 @@ class _Descent:
     def _follow(self, way: ShortestWay, probe: Probe) -> None:
         """A step by known rows; where they lead nowhere, the way goes on as with many coordinates."""
         self._done += 1
-        goes_on = way.see(self.point, probe)
-        if self._iterations is not None and self._done >= self._iterations:
-            self.reason = "iterations"
-        elif goes_on:
-            self.point = way.next()
+        if way.see(self.point, probe):
+            self._go_by(way)
         else:
             self._shortest, self._is_lost = None, True
             self._value, self.point = math.inf, way.best
+
+    def _go_by(self, way: ShortestWay) -> None:
+        if self._iterations is not None and self._done >= self._iterations:
+            self.reason = "iterations"
+        else:
+            self.point = way.next()
+
+    def _knows(self, metric: Metric | KnownRows) -> TypeGuard[KnownRows]:
+        """Whether there are rows that lead somewhere."""
+        return isinstance(metric, KnownRows) and not self._is_lost
 
     def _weigh(self, probe: Probe) -> tuple[float, Float[Tensor, "N"]]:
         """What is minimised, and the weights of the residual in its gradient."""
