@@ -49,7 +49,8 @@ def gauss_newton(
         residuals: What should vanish.
         latents: Where to start.
         keep: 1 where a token may change, 0 in padding and where it is held fixed.
-        stopping: Limits; an evaluation is one pass forward, with a pass back if its point is taken.
+        stopping: Limits; an evaluation is one pass forward, with a pass back where one is needed. A clip's
+            own Jacobian, made at its start, is not counted.
         progress: Called after every evaluation.
     """
     latents = latents.detach()

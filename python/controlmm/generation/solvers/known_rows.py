@@ -50,7 +50,7 @@ class KnownRows:
         self._seen.clear()
 
     def bend(self, memory: Curvature) -> None:
-        """From here on steps are shortest where ``memory``, of the natural part, says that it is stiff."""
+        """From here on steps avoid directions that are stiff by ``memory``, that of the natural part."""
         self._ways = torch.stack([-memory.direction(row) for row in self._rows])
 
     def step(self, residual: Float[Tensor, "N"]) -> Float[Tensor, "U"]:
