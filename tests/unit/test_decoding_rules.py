@@ -8,10 +8,11 @@ import pytest
 import torch
 
 from controlmm.controls import JointControl
-from controlmm.generation import masked_decoding
+from controlmm.generation import logits_editing
 from controlmm.generation.decoding_request import DecodingRequest
 from controlmm.generation.decoding_rules import DecodingRules, likeliest_share
-from controlmm.generation.editing import EditingBudget, edit_logits
+from controlmm.generation.editing import EditingBudget
+from controlmm.generation.logits_editing import LogitsEditing, edit_logits
 from controlmm.generation.masked_decoding import (
     decode_from_text,
     decode_with_control,
@@ -27,6 +28,7 @@ from controlmm.ops.obstacles import Sphere
 from controlmm.pipelines import PRESETS, Preset
 
 EXACT = 1e-6
+HEAD = JointControl("head", frames=[5], positions=[[0, 1.5, 0.3]])
 
 
 def request(tokens=6, *, steps=3, seed=0, **rules) -> DecodingRequest:
@@ -47,14 +49,15 @@ def objective_of(pipeline, tokens=6, *, norm="mse") -> ControlObjective:
     return ControlObjective(pipeline.decoder, targets, mask, frames, norm=norm)
 
 
-def final_logits(pipeline, *, budget=None, **rules):
+def final_logits(pipeline, *, budget=None, wanted=None, **rules):
+    objective, wanted = objective_of(pipeline), wanted or request(**rules)
     return decode_with_control(
         pipeline.transformer,
         pipeline.control,
         pipeline.decoder,
-        objective_of(pipeline),
-        request(**rules),
-        budget=budget or EditingBudget(),
+        objective,
+        wanted,
+        editing=LogitsEditing(objective, pipeline.tokenizer, wanted, budget or EditingBudget()),
     )
 
 
@@ -95,10 +98,66 @@ def test_every_decoding_step_edits_as_often_as_it_should(tiny_pipeline, monkeypa
         seen.append(iterations)
         return logits
 
-    monkeypatch.setattr(masked_decoding, "edit_logits", kept)
-    final_logits(tiny_pipeline, budget=EditingBudget(logits_iterations=2))
-    final_logits(tiny_pipeline, budget=EditingBudget(logits_iterations=2, logits_iterations_grow=True))
+    monkeypatch.setattr(logits_editing, "edit_logits", kept)
+    constant = EditingBudget(logits_iterations=2)
+    growing = EditingBudget(logits_iterations=2, logits_iterations_grow=True)
+    final_logits(tiny_pipeline, budget=constant, last_edit="base")
+    final_logits(tiny_pipeline, budget=growing, last_edit="base")
     assert seen == [2, 2, 2, 2, 4, 6]
+
+
+# --- ours: the last step's editing sees the residual layers ---
+
+
+def last_logits_edited(pipeline, budget, last_edit, monkeypatch):
+    """For each call: the step's iterations and whether there were finer latents."""
+    seen = []
+
+    def kept(logits, *_, iterations, finer, **__):
+        seen.append((iterations, torch.is_tensor(finer)))
+        return logits
+
+    monkeypatch.setattr(logits_editing, "edit_logits", kept)
+    preset = Preset(budget, steps=3, rules=DecodingRules(last_edit=last_edit))
+    pipeline("a person walks", frames=16, controls=[HEAD], preset=preset)
+    return seen
+
+
+def test_the_last_edit_is_made_as_often_but_with_all_layers(tiny_pipeline, monkeypatch):
+    budget = EditingBudget(logits_iterations=2, logits_iterations_grow=True, latent_iterations=0)
+    found = {
+        rule: last_logits_edited(tiny_pipeline, budget, rule, monkeypatch) for rule in ("base", "all_layers")
+    }
+    assert found["base"] == [(2, False), (4, False), (6, False)]
+    assert found["all_layers"] == [(2, False), (4, False), (6, True)]
+
+
+@pytest.mark.parametrize("final_tokens", ["mixture", "sampled"])
+def test_motions_end_nearer_to_their_targets_when_the_last_edit_sees_all_layers(tiny_pipeline, final_tokens):
+    errors = {}
+    for rule in ("base", "all_layers"):
+        preset = Preset(
+            EditingBudget(logits_iterations=40, latent_iterations=0),
+            steps=2,
+            rules=DecodingRules(last_edit=rule, final_tokens=final_tokens, editing_noise="none"),
+        )
+        errors[rule] = tiny_pipeline(
+            "a person walks", frames=16, controls=[HEAD], preset=preset
+        ).control_error
+    assert errors["all_layers"] < 0.8 * errors["base"]
+
+
+def test_without_logits_editing_the_rule_of_the_last_edit_changes_nothing(tiny_pipeline):
+    latents = [
+        tiny_pipeline(
+            "a person walks",
+            frames=16,
+            controls=[HEAD],
+            preset=Preset(EditingBudget(latent_iterations=2), steps=2, rules=DecodingRules(last_edit=rule)),
+        ).latents
+        for rule in ("base", "all_layers")
+    ]
+    assert torch.equal(*latents)
 
 
 # --- row 5: the control loss at inference ---
@@ -176,13 +235,12 @@ def test_editing_without_noise_draws_nothing(tiny_pipeline):
     """The noise of a step then starts where it would start without any editing."""
     budget = EditingBudget(logits_iterations=2)
     quiet = request(editing_noise="none")
-    arguments = (tiny_pipeline.transformer, tiny_pipeline.control, tiny_pipeline.decoder)
-    decode_with_control(*arguments, objective_of(tiny_pipeline), quiet, budget=budget)
+    final_logits(tiny_pipeline, wanted=quiet, budget=budget)
     unedited = request()
-    decode_with_control(*arguments, objective_of(tiny_pipeline), unedited, budget=EditingBudget())
+    final_logits(tiny_pipeline, wanted=unedited)
     assert torch.equal(quiet.gumbel(8), unedited.gumbel(8))
     noisy = request()
-    decode_with_control(*arguments, objective_of(tiny_pipeline), noisy, budget=budget)
+    final_logits(tiny_pipeline, wanted=noisy, budget=budget)
     assert not torch.equal(noisy.gumbel(8), request().gumbel(8))
 
 
@@ -215,9 +273,8 @@ def test_tokens_on_the_way_are_drawn_with_a_second_noise_or_without(tiny_pipelin
     once = final_logits(tiny_pipeline, noise_twice=False)
     twice = final_logits(tiny_pipeline)
     assert not torch.equal(once, twice)
-    arguments = (tiny_pipeline.transformer, tiny_pipeline.control, tiny_pipeline.decoder)
     left = request(steps=1, noise_twice=False)
-    decode_with_control(*arguments, objective_of(tiny_pipeline), left, budget=EditingBudget())
+    final_logits(tiny_pipeline, wanted=left)
     after_one = request()
     after_one.gumbel(32)
     assert torch.equal(left.gumbel(32), after_one.gumbel(32))

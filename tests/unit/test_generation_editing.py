@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from controlmm.generation.editing import EditingBudget, edit_logits
+from controlmm.generation.editing import EditingBudget
+from controlmm.generation.logits_editing import edit_logits
 from controlmm.generation.objective import ControlObjective, control_error
 from controlmm.models.rvq_vae import frame_mask
 

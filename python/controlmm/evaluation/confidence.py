@@ -12,7 +12,9 @@ from torch import Tensor
 from controlmm.evaluation.controlmm_tables import without_control_model
 from controlmm.evaluation.motion_sources import Batch
 from controlmm.generation.decoding_request import DecodingRequest
+from controlmm.generation.decoding_rules import DecodingRules
 from controlmm.generation.editing import EditingBudget
+from controlmm.generation.logits_editing import LogitsEditing
 from controlmm.generation.masked_decoding import decode_from_text, decode_with_control
 from controlmm.generation.noise import ClipNoise
 from controlmm.generation.objective import ControlObjective
@@ -80,6 +82,7 @@ def _watched(
         valid,
         ClipNoise(batch.noise_seeds),
         steps=steps,
+        rules=DecodingRules(last_edit="base"),  # no residual layers are made here
         watch=lambda _, confidence: seen.append(confidence.masked_fill(~valid, torch.nan)),
     )
     if controlled is None:
@@ -95,7 +98,9 @@ def _watched(
         pipeline.decoder,
         objective,
         request,
-        budget=EditingBudget(logits_iterations=iterations),
+        editing=LogitsEditing(
+            objective, pipeline.tokenizer, request, EditingBudget(logits_iterations=iterations)
+        ),
     )
     return torch.stack(seen)
 

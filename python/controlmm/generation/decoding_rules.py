@@ -11,16 +11,20 @@ from jaxtyping import Float
 from torch import Tensor
 
 EditingNoise = Literal["gumbel", "none", "as_printed"]
+LastEdit = Literal["all_layers", "base"]
 FinalTokens = Literal["mixture", "sampled"]
 ResidualTokens = Literal["likeliest", "sampled"]
 
 
 @dataclass(frozen=True)
 class DecodingRules:
-    """The defaults are the published code's, but for ``pad_class``."""
+    """The defaults are the published code's, but for ``last_edit`` and ``pad_class``."""
 
     editing_noise: EditingNoise = (
         "gumbel"  # in logits editing; paper, formula 7: none; 10 as it is: as_printed
+    )
+    last_edit: LastEdit = (
+        "all_layers"  # logits editing of the last step sees the residual layers; published: "base" alone
     )
     noise_twice: bool = True  # tokens on the way are drawn from weights that hold noise already; False: once
     text_top_share: float = 0.1  # of the codes can be drawn when decoding from text ("top-k 0.9")
@@ -34,6 +38,7 @@ class DecodingRules:
     def __post_init__(self) -> None:
         for name, kind in (
             ("editing_noise", EditingNoise),
+            ("last_edit", LastEdit),
             ("final_tokens", FinalTokens),
             ("residual_tokens", ResidualTokens),
         ):

@@ -11,13 +11,13 @@ from torch import Tensor
 from controlmm.generation.controlled_layers import ControlledLayers, without_base
 from controlmm.generation.decoding_request import DecodingRequest
 from controlmm.generation.decoding_rules import likeliest_share
-from controlmm.generation.editing import EditingBudget, edit_logits
 from controlmm.generation.guided_logits import (
     base_prediction,
     controlled_prediction,
     guided,
     residual_prediction,
 )
+from controlmm.generation.logits_editing import LogitsEditing
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.objective import ControlObjective
 from controlmm.generation.partial_decoder import PartialDecoder, controlled_joints
@@ -62,14 +62,14 @@ def decode_with_control(
     objective: ControlObjective,
     request: DecodingRequest,
     *,
-    budget: EditingBudget,
+    editing: LogitsEditing | None = None,
 ) -> Float[Tensor, "B L K"]:
     """Final base logits of motions that follow a text and spatial targets.
 
     Unlike without control, tokens stay soft: every step predicts all of them anew, and the motion comes from
     the last logits, not from the ids that were drawn on the way. Those only decide where MASK is put back.
-    Without a ``branch`` only logits editing follows the objective, which then need not hold targets. Tokens
-    that are kept have logits that leave no doubt.
+    Without a ``branch`` only logits ``editing`` follows the objective, which then need not hold targets.
+    Tokens that are kept have logits that leave no doubt.
     """
     valid, codes, rules, kept = request.valid, decoder.tokenizer.base_codes, request.rules, request.kept
     keep = valid[..., None].float()
@@ -94,18 +94,8 @@ def decode_with_control(
             logits = guided(controlled_prediction(base, branch, embedded, hint), request)
         if kept is not None:
             logits = kept.certain(logits)
-        if budget.logits_iterations:
-            logits = edit_logits(
-                logits,
-                objective,
-                codes,
-                iterations=budget.logits_iterations_in(step),
-                noise=lambda: None if rules.editing_noise == "none" else request.gumbel(len(codes)),
-                keep=keep,
-                as_printed=rules.editing_noise == "as_printed",
-                rate=budget.logits_rate,
-                optimizer=budget.optimizer,
-            )
+        if editing is not None:
+            logits = editing.within(logits, step)
         weights = token_mixture(likeliest_share(logits, rules.top_share), request.gumbel(len(codes)))
         embedded = base.embed_soft(weights)
         second = request.gumbel(len(codes)) if rules.noise_twice else 0.0

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from controlmm.generation.controlled_layers import ControlledLayers
 from controlmm.generation.decoding_request import DecodingRequest
+from controlmm.generation.logits_editing import LogitsEditing
 from controlmm.generation.masked_decoding import (
     decode_from_text,
     decode_with_control,
@@ -34,13 +36,14 @@ def drawn_latents(
     """Latents before they are edited; a ``branch`` and logits editing take them towards targets."""
     if branch is None and not preset.budget.logits_iterations:
         return latents_from_text(pipeline, request, preset)
+    editing = LogitsEditing(objective, pipeline.decoder.tokenizer, request, preset.budget)
     logits = decode_with_control(
         pipeline.packed(pipeline.transformer, request.dtype),
         None if branch is None else pipeline.packed(branch, request.dtype),
         pipeline.decoder,
         objective,
         request,
-        budget=preset.budget,
+        editing=editing,
     )
     base_ids = final_base_ids(logits, request)
     control = None
@@ -56,6 +59,9 @@ def drawn_latents(
             strength=pipeline.guidance.control,
         ).quick(objective.frames, request.dtype)
     ids = _all_layers(pipeline, base_ids, request, preset, control)
+    if editing.ends_with_all_layers:
+        logits = editing.with_all_layers(logits, ids)
+        ids = _put_back(torch.cat([final_base_ids(logits, request)[..., None], ids[..., 1:]], -1), request)
     return final_latents(pipeline.decoder.tokenizer, logits, ids, request)
 
 
@@ -84,4 +90,9 @@ def _all_layers(
         guidance_scale=pipeline.guidance.under(preset).residual,
         control=control,
     )
+    return _put_back(ids, request)
+
+
+def _put_back(ids: Int[Tensor, "B L Q"], request: DecodingRequest) -> Int[Tensor, "B L Q"]:
+    """With the tokens of a motion that stays."""
     return ids if request.kept is None else request.kept.put_back(ids)

@@ -15,7 +15,6 @@ from torch.nn.utils.rnn import pad_sequence
 from controlmm.data.clip import FeatureClip
 from controlmm.generation.controlled_layers import ControlledLayers
 from controlmm.generation.decoding_request import DecodingRequest
-from controlmm.generation.editing import EditingBudget
 from controlmm.generation.masked_decoding import (
     decode_from_text,
     decode_with_control,
@@ -35,7 +34,6 @@ from controlmm.training.stage import NORMALIZER_FILE, StageInputs, best_weights,
 _SHOWN = 3  # clips
 _FRAMES = 40, 196  # shortest and longest clip worth a look
 _PELVIS = 0
-_NO_EDITING = EditingBudget(logits_iterations=0, latent_iterations=0)
 
 
 @dataclass(frozen=True)
@@ -97,7 +95,7 @@ def clips_with_control(recipe: Recipe, inputs: StageInputs) -> Sequence[Sample]:
     request = _request(shown, decoder, inputs)
     recorded = _recorded(decoder, shown)
     objective = ControlObjective(decoder, recorded, _pelvis_path(recorded, shown), shown.frames)
-    logits = decode_with_control(base, _on_cpu(recipe.model), decoder, objective, request, budget=_NO_EDITING)
+    logits = decode_with_control(base, _on_cpu(recipe.model), decoder, objective, request)
     latents = logits.softmax(-1) @ decoder.tokenizer.base_codes * request.valid[..., None]
     return shown.samples(recorded, decoder(latents, shown.frames), " (text and path, base codes)")
 
