@@ -14,7 +14,7 @@ from controlmm import ControlMM
 from controlmm.evaluation.batch_scores import BatchScores, score_batch
 from controlmm.evaluation.control_draws import ControlSetting
 from controlmm.evaluation.evaluators import Evaluator
-from controlmm.evaluation.motion_sources import Batch, Produced
+from controlmm.evaluation.motion_sources import Batch, Produced, pooled_texts
 from controlmm.evaluation.protocol import Protocol, batches_of
 from controlmm.evaluation.retrieval import GROUP
 from controlmm.evaluation.scores import repeat_scores
@@ -115,7 +115,7 @@ class Bench:
     def _latents(self, plan: Preset, batch: Batch) -> Tensor:
         pipeline, budget = self.pipeline, plan.budget
         return pipeline.generate_latents(
-            pipeline.text_encoder.encode([sample.caption.text for sample in batch.samples]).pooled,
+            pooled_texts(pipeline.text_encoder, batch.samples),
             lengths=batch.lengths.tolist(),
             targets=batch.joints,
             mask=batch.mask[..., None].expand_as(batch.joints),

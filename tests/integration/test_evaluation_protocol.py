@@ -13,7 +13,14 @@ import torch
 from controlmm.data import Caption, Clip, write_folder
 from controlmm.evaluation.control_draws import ControlSetting
 from controlmm.evaluation.evaluators import Evaluator, LearnedEvaluator, load_evaluator
-from controlmm.evaluation.motion_sources import Batch, Generated, Produced, RealMotion, Reconstruction
+from controlmm.evaluation.motion_sources import (
+    Batch,
+    Generated,
+    Produced,
+    RealMotion,
+    Reconstruction,
+    pooled_texts,
+)
 from controlmm.evaluation.protocol import Protocol, Row, evaluate_rows
 from controlmm.evaluation.report import ResultPage
 from controlmm.evaluation.test_set import Item, TestSet, read_test_set
@@ -21,6 +28,7 @@ from controlmm.generation.editing import EditingBudget
 from controlmm.models.motion_text_matcher import MatcherConfig, MotionTextMatcher
 from controlmm.motion.skeleton import KIT
 from controlmm.pipelines import ControlMM, Preset
+from controlmm.text.encoder import TextFeatures
 from controlmm.text.hashing import HashingTextEncoder
 
 QUICK = Preset(EditingBudget(latent_iterations=2), steps=2)
@@ -129,6 +137,26 @@ def test_a_clips_result_does_not_depend_on_its_batch(
         [errors(TestSet((item,), "train", test_set.kinds), item.id) for item in test_set.items]
     )
     torch.testing.assert_close(alone.mean(0), together, rtol=ROUNDING, atol=ROUNDING)
+
+
+def test_captions_are_encoded_as_in_a_call_whatever_the_batch_and_the_threads(test_set: TestSet) -> None:
+    """Of a batch, or by more threads, real encoders give other last bits."""
+
+    class Crowded(HashingTextEncoder):
+        def encode(self, prompts: Sequence[str]) -> TextFeatures:
+            plain = super().encode(prompts)
+            crowd = len(prompts) + torch.get_num_threads()
+            return dataclasses.replace(plain, pooled=plain.pooled + crowd)
+
+    samples = test_set.samples(seed=0, repeat=0)[:3]
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        together = pooled_texts(Crowded(64), samples)
+    finally:
+        torch.set_num_threads(before)
+    alone = HashingTextEncoder(64).encode([sample.caption.text for sample in samples]).pooled
+    assert torch.equal(together, alone + 2)
 
 
 def test_other_settings_are_not_mixed_into_a_folder(

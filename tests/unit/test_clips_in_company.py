@@ -74,8 +74,8 @@ def assert_in_company(pipeline: ControlMM, plan: Preset, *, is_free: bool = Fals
     if plan.budget.latent_iterations > STEPS:
         plan = replace(plan, budget=replace(plan.budget, latent_iterations=STEPS))
     together = latents_of(pipeline, [0, 1, 2, 3], plan, is_free=is_free)
-    for clips in [[3, 2, 1], [0], [1], [2]]:
-        with threads(1):
+    for clips, cores in [([3, 2, 1], 1), ([0], 1), ([1], 1), ([2], 1), ([0], 2)]:
+        with threads(cores):
             others = latents_of(pipeline, clips, plan, is_free=is_free)
         for clip, latents in zip(clips, others, strict=True):
             assert torch.equal(latents, together[clip])

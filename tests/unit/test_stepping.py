@@ -67,7 +67,9 @@ def test_steps_do_not_depend_on_the_batch(scene, all_slide):
     assert torch.equal(with_steps(alone, latents[:1], valid[:1], BUDGET), together)
 
 
-@pytest.mark.parametrize("change", [{"naturalness": 0.0}, {"time_budget": 1.0}, {"solver": "papers"}])
+@pytest.mark.parametrize(
+    "change", [{"naturalness": 0.0}, {"time_budget": 1.0}, {"solver": "papers"}, {"latent_iterations": 0}]
+)
 def test_budgets_without_steps(scene, all_slide, change):
     objective, latents, valid = scene
     assert with_steps(objective, latents, valid, replace(BUDGET, **change)) is latents

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from controlmm.evaluation.controlmm_tables import without_control_model
-from controlmm.evaluation.motion_sources import Batch
+from controlmm.evaluation.motion_sources import Batch, pooled_texts
 from controlmm.generation.decoding_request import DecodingRequest
 from controlmm.generation.decoding_rules import DecodingRules
 from controlmm.generation.editing import EditingBudget
@@ -78,7 +78,7 @@ def _watched(
     valid = frame_mask(tokens, int(tokens.max()))
     seen: list[Tensor] = []
     request = DecodingRequest(
-        pipeline.text_encoder.encode([sample.caption.text for sample in batch.samples]).pooled,
+        pooled_texts(pipeline.text_encoder, batch.samples),
         valid,
         ClipNoise(batch.noise_seeds),
         steps=steps,

@@ -14,10 +14,11 @@ from torch import Tensor
 from controlmm.evaluation.random_streams import stream_seed
 from controlmm.evaluation.test_set import MAX_FRAMES, Sample
 from controlmm.generation.exact import all_meet_exactly
+from controlmm.generation.one_thread import one_thread
 from controlmm.models.rvq_vae import frame_mask
 from controlmm.ops import recover_joints
 from controlmm.pipelines.pipeline import MotionPipeline
-from controlmm.text.encoder import weights_sha256
+from controlmm.text.encoder import TextEncoder, weights_sha256
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +51,15 @@ class Batch:
     def lengths(self) -> Int[Tensor, "B"]:
         """Frames of each sample."""
         return torch.tensor([sample.length for sample in self.samples])
+
+
+@one_thread()
+def pooled_texts(encoder: TextEncoder, samples: Sequence[Sample]) -> Float[Tensor, "B E"]:
+    """The captions' vectors, each caption encoded by itself, as a call does it.
+
+    In a batch or by more threads a vector differs in its last bits, and editing makes centimetres of them.
+    """
+    return torch.cat([encoder.encode([sample.caption.text]).pooled for sample in samples])
 
 
 def padded_features(samples: Sequence[Sample]) -> Float[Tensor, "B 196 D"]:
@@ -154,7 +164,7 @@ class Generated:
         """The pipeline's latents under ``preset``."""
         pipeline = self.pipeline
         return pipeline.generate_latents(
-            pipeline.text_encoder.encode([sample.caption.text for sample in batch.samples]).pooled,
+            pooled_texts(pipeline.text_encoder, batch.samples),
             lengths=batch.lengths.tolist(),
             targets=batch.joints,
             mask=batch.mask[..., None].expand_as(batch.joints),

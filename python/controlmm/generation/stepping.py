@@ -33,7 +33,7 @@ def with_steps(
 
     Feet are given places to stand, see :mod:`controlmm.generation.step_plan`, for these rounds only: the
     editing that follows meets the targets alone. Nothing is done without naturalness, which is what steps are
-    for, or with a time budget, which is for the targets.
+    for, with a time budget, which is for the targets, or where no editing follows.
 
     Args:
         objective: Targets of the clips; obstacles and other terms do not count here.
@@ -42,7 +42,8 @@ def with_steps(
         budget: Of the editing that follows.
         progress: Called after every evaluation, with both rounds as one phase.
     """
-    if not budget.naturalness or budget.time_budget is not None or budget.solver == "papers":
+    is_edited = budget.latent_iterations > 0 and budget.solver != "papers"
+    if not is_edited or not budget.naturalness or budget.time_budget is not None:
         return latents
     skeleton = objective.decoder.normalizer.skeleton
     rows = [row for row, clip in enumerate(_clips(objective, latents)) if slides(*clip, skeleton)]
