@@ -44,7 +44,11 @@ def variants() -> dict[str, Preset]:
             f"top share {share:g}": replace(default, rules=replace(default.rules, text_top_share=share))
             for share in (0.02, 0.05, 0.2, 1.0)
         },
-        **{f"{steps} steps": replace(default, steps=steps) for steps in (5, 18)},
+        **{
+            f"guided share {share:g}": replace(default, guided_share=share)
+            for share in (0.0, 0.25, 0.75, 1.0)
+        },
+        **{f"steps {steps}": replace(default, steps=steps) for steps in (5, 10, 18)},
     }
 
 

@@ -121,16 +121,16 @@ def test_editing_lowers_the_control_error(tiny_pipeline):
 
 
 def test_logits_editing_takes_part_in_every_decoding_step(tiny_pipeline, monkeypatch):
-    from controlmm.generation import masked_decoding
+    from controlmm.generation import logits_editing
 
     iterations = []
-    edit = masked_decoding.edit_logits
+    edit = logits_editing.edit_logits
 
     def counted(*args, **options):
         iterations.append(options["iterations"])
         return edit(*args, **options)
 
-    monkeypatch.setattr(masked_decoding, "edit_logits", counted)
+    monkeypatch.setattr(logits_editing, "edit_logits", counted)
     plan = Preset(EditingBudget(logits_iterations=2, latent_iterations=0), steps=4)
     tiny_pipeline(PROMPT, frames=16, controls=[WRIST], preset=plan)
     assert iterations == [2, 2, 2, 2]

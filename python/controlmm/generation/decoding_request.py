@@ -29,11 +29,16 @@ class DecodingRequest:
     noise: ClipNoise
     steps: int = 10
     guidance_scale: float = 4.0
+    guided_share: float = 1.0  # of the steps, the first ones
     rules: DecodingRules = field(default_factory=DecodingRules)
     progress: Progress | None = None
     watch: Callable[[int, Float[Tensor, "B L"]], None] | None = None  # (step, confidence of every token)
     kept: KeptTokens | None = None  # of a motion that is there; the others are drawn
     dtype: torch.dtype = torch.float32
+
+    def guidance_in(self, step: int) -> float:
+        """Scale of guidance in a step, counted from 0."""
+        return self.guidance_scale if step < self.guided_share * self.steps else 1.0
 
     @property
     def lengths(self) -> list[int]:

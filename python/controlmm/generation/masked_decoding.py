@@ -45,7 +45,7 @@ def decode_from_text(base: MaskedTransformer, request: DecodingRequest) -> Int[T
     for step in range(request.steps):
         hidden = lowest(scores, masked_counts(request, step))
         ids = torch.where(hidden, base.mask_id, ids)
-        logits = guided(base_prediction(base, base.embed(ids)), request)
+        logits = guided(base_prediction(base, base.embed(ids)), request, scale=request.guidance_in(step))
         allowed = likeliest_share(logits, request.rules.text_top_share)
         drawn = (allowed + request.gumbel(logits.shape[-1])).argmax(-1)
         ids = torch.where(hidden, drawn, ids)
@@ -85,13 +85,14 @@ def decode_with_control(
     for step in range(request.steps):
         hidden = lowest(scores, masked_counts(request, step))[..., None]
         embedded = torch.where(hidden, mask_embedding, embedded)
+        scale = request.guidance_in(step)
         if branch is None:
-            logits = guided(base_prediction(base, embedded), request)
+            logits = guided(base_prediction(base, embedded), request, scale=scale)
         else:
             latents = torch.where(hidden, mean_code, row_product(logits.softmax(-1), codes)) * keep
             signal = branch.signal(objective.targets, objective.mask, part.positions(latents))
             hint = branch.hint(signal, valid)
-            logits = guided(controlled_prediction(base, branch, embedded, hint), request)
+            logits = guided(controlled_prediction(base, branch, embedded, hint), request, scale=scale)
         if kept is not None:
             logits = kept.certain(logits)
         if editing is not None:

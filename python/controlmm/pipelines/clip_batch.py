@@ -86,12 +86,14 @@ class ClipBatch:
 
     def request(self, pipeline: ControlMM, preset: Preset, progress: Progress | None) -> DecodingRequest:
         """What is asked of masked decoding."""
+        scales = pipeline.guidance.under(preset)
         return DecodingRequest(
             self.text,
             self.valid,
             ClipNoise(self.seeds),
             steps=preset.steps,
-            guidance_scale=pipeline.guidance.under(preset).base,
+            guidance_scale=scales.base,
+            guided_share=scales.share,
             rules=preset.rules,
             progress=progress,
             dtype=pipeline.drawing_dtype(preset),

@@ -108,7 +108,12 @@ class ControlMM(MotionPipeline[Preset]):
         """See :class:`MotionPipeline`."""
         plan = resolve_preset(preset, guidance_scale=guidance_scale)
         scales = self.guidance.under(plan)
-        return replace(plan, guidance_scale=scales.base, residual_guidance_scale=scales.residual)
+        return replace(
+            plan,
+            guidance_scale=scales.base,
+            residual_guidance_scale=scales.residual,
+            guided_share=scales.share,
+        )
 
     @torch.no_grad()
     @one_thread()

@@ -75,7 +75,7 @@ def run_edit(
     padded = pipeline.padded_frames(frames)
     ids = _tokens(pipeline, scene, padded)
     text = pipeline.text_encoder.encode([scene.prompt]).pooled
-    seeds = clip_seeds(seed, samples)
+    seeds, scales = clip_seeds(seed, samples), pipeline.guidance.under(preset)
 
     def edited(rows: Tensor, report: Progress | None) -> Tensor:
         count = len(rows)
@@ -85,7 +85,8 @@ def run_edit(
             torch.ones(own_ids.shape[:2], dtype=torch.bool),
             ClipNoise([seeds[row] for row in rows.tolist()]),
             steps=preset.steps,
-            guidance_scale=pipeline.guidance.under(preset).base,
+            guidance_scale=scales.base,
+            guided_share=scales.share,
             rules=preset.rules,
             progress=report,
             kept=_kept_tokens(pipeline, scene, own_ids),

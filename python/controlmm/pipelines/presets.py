@@ -13,6 +13,7 @@ from controlmm.ops.consistency import NORM_CODES, Norm
 
 _LENGTHS = {"m": 1.0, "mm": 0.001, "cm": 0.01}
 _TIMES = {"s": 1.0, "ms": 0.001}
+_STEPS = 6  # of masked decoding: on validation clips no worse than the papers' ten (docs/solvers.md)
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,7 @@ class Preset:
     steps: int = 10  # of masked decoding
     guidance_scale: float | None = None  # None: what suits the model
     residual_guidance_scale: float | None = None
+    guided_share: float | None = None  # of the steps, the first ones
     control_norm: Norm = "mse"  # of the distance that editing minimises: published code; the paper: "l2"
     rules: DecodingRules = field(default_factory=DecodingRules)
     is_exact: bool = (
@@ -40,12 +42,19 @@ class Preset:
             is_number = isinstance(value, int | float) and math.isfinite(value)
             if value is not None and not is_number:
                 raise ValueError(f"`{name}` must be a finite number, got {value!r}.")
+        if self.guided_share is not None and not 0 <= self.guided_share <= 1:
+            raise ValueError(f"`guided_share` must be from 0 to 1, got {self.guided_share!r}.")
 
 
 def _ours(iterations: int, tolerance: float, *, is_exact: bool = False) -> Preset:
     """Editing until a tolerance, with naturalness."""
     budget = EditingBudget(solver="auto", latent_iterations=iterations, tolerance=tolerance, naturalness=1.0)
-    return Preset(budget, is_exact=is_exact, is_bfloat16=True)
+    return Preset(budget, steps=_STEPS, is_exact=is_exact, is_bfloat16=True)
+
+
+def _papers(*, logits: int = 0, codebook: int) -> Preset:
+    """The papers' iterations; guidance in all steps."""
+    return Preset(EditingBudget(logits_iterations=logits, latent_iterations=codebook), guided_share=1.0)
 
 
 # `python -m benchmarks.editing` measures them. The papers' iteration counts are there to compare with.
@@ -54,21 +63,21 @@ PRESETS = {
     "balanced": _ours(40, 0.003),
     "accurate": _ours(80, 0.001),
     "exact": _ours(80, 0.001, is_exact=True),
-    "paper-fast": Preset(EditingBudget(latent_iterations=100)),
-    "paper-medium": Preset(EditingBudget(latent_iterations=600)),
-    "paper-accurate": Preset(EditingBudget(logits_iterations=100, latent_iterations=600)),
+    "paper-fast": _papers(codebook=100),
+    "paper-medium": _papers(codebook=600),
+    "paper-accurate": _papers(logits=100, codebook=600),
 }
 
 
 def resolve_preset(preset: str | Preset, *, guidance_scale: float | None = None) -> Preset:
-    """``preset`` itself, or the one of that name; with another ``guidance_scale`` if one is given.
+    """``preset`` itself, or the one of that name; with ``guidance_scale`` in all steps if one is given.
 
     Raises:
         TypeError: If it is neither.
         ValueError: If there is none of that name, or the scale is no number.
     """
     plan = _resolved(preset)
-    return plan if guidance_scale is None else replace(plan, guidance_scale=guidance_scale)
+    return plan if guidance_scale is None else replace(plan, guidance_scale=guidance_scale, guided_share=1.0)
 
 
 def _resolved(preset: str | Preset) -> Preset:
