@@ -60,7 +60,7 @@ def test_steps_without_guidance_cost_one_prediction(tiny_pipeline, monkeypatch, 
     assert sum(seen) == passes
 
 
-@pytest.mark.parametrize("share", [-0.1, 1.1])
+@pytest.mark.parametrize("share", [-0.1, 1.1, float("nan"), "half"])
 def test_impossible_shares_are_refused(share):
     with pytest.raises(ValueError, match="`guided_share` must be from 0 to 1"):
         replace(PRESETS["fast"], guided_share=share)

@@ -261,3 +261,11 @@ def test_impossible_edits_are_refused(tiny_pipeline, monkeypatch, source, option
     monkeypatch.setattr(type(tiny_pipeline.text_encoder), "encode", never)
     with pytest.raises(kind, match=message):
         tiny_pipeline.edit(**{"motion": source, "prompt": "a person jumps", **options})
+
+
+def test_a_motion_drifts_for_ten_steps_however_few_a_preset_draws_in(tiny_pipeline, source):
+    seen = []
+    tiny_pipeline.edit(source, "a person jumps", preset=QUICK, progress=lambda *step: seen.append(step))
+    assert [step for step in seen if step[0] == "masked decoding"] == [
+        ("masked decoding", done, 10) for done in range(1, 11)
+    ]

@@ -12,6 +12,7 @@ from controlmm.generation.guided_logits import base_prediction, guided
 from controlmm.generation.masked_decoding import DECIDED, lowest
 from controlmm.models.masked_transformer import MaskedTransformer
 
+VARIATION_STEPS = 10  # that carry a motion as far as MoMask's, however few a preset needs to draw one
 VARIED_SHARE = 0.16  # of the tokens that each step draws anew: MoMask's, without an edit mask
 
 

@@ -140,7 +140,7 @@ class ControlMM(MotionPipeline[Preset]):
           a new ending, beginning or middle.
         - ``keep_parts``: these parts stay at all frames, under control: ``["lower"]`` (pelvis and feet) gives
           the upper body a new task.
-        - neither: every decoding step draws the least certain 16 % of the tokens anew; the motion drifts
+        - neither: each of ten steps draws the least certain 16 % of the tokens anew; the motion drifts
           towards the prompt.
 
         Controls, obstacles and objectives count as in a call, in the world of ``motion``.

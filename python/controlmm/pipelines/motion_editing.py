@@ -21,7 +21,7 @@ from controlmm.generation.objective import ControlObjective, control_error
 from controlmm.generation.shares import in_shares
 from controlmm.generation.solvers import Progress
 from controlmm.generation.terms import JointTerm
-from controlmm.generation.variation import vary_tokens
+from controlmm.generation.variation import VARIATION_STEPS, vary_tokens
 from controlmm.motion.motion import Motion
 from controlmm.ops import recover_joints
 from controlmm.pipelines.checks import check_sampling
@@ -154,7 +154,7 @@ def _drawn(
     if not scene.kept.any():
         base = pipeline.packed(pipeline.transformer, request.dtype)
         residual = pipeline.packed(pipeline.residual, request.dtype)
-        base_ids = vary_tokens(base, request, ids[..., 0])
+        base_ids = vary_tokens(base, replace(request, steps=VARIATION_STEPS), ids[..., 0])
         varied = fill_residual_layers(residual, base_ids, request, guidance_scale=_RESIDUAL_GUIDANCE)
         is_same = (base_ids == ids[..., 0])[..., None]
         return pipeline.decoder.tokenizer.quantizer.lookup(torch.where(is_same, ids, varied))

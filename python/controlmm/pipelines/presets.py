@@ -42,8 +42,9 @@ class Preset:
             is_number = isinstance(value, int | float) and math.isfinite(value)
             if value is not None and not is_number:
                 raise ValueError(f"`{name}` must be a finite number, got {value!r}.")
-        if self.guided_share is not None and not 0 <= self.guided_share <= 1:
-            raise ValueError(f"`guided_share` must be from 0 to 1, got {self.guided_share!r}.")
+        share = self.guided_share
+        if share is not None and not (isinstance(share, int | float) and 0 <= share <= 1):
+            raise ValueError(f"`guided_share` must be from 0 to 1, got {share!r}.")
 
 
 def _ours(iterations: int, tolerance: float, *, is_exact: bool = False) -> Preset:
