@@ -7,6 +7,7 @@ add_library(controlmm_kernels STATIC
   ${csrc}/runtime/consistency.cpp
   ${csrc}/runtime/cpu_features.cpp
   ${csrc}/runtime/dispatch.cpp
+  ${csrc}/runtime/exact.cpp
   ${csrc}/runtime/guidance.cpp
   ${csrc}/runtime/gumbel.cpp
   ${csrc}/runtime/kinematics.cpp

@@ -114,6 +114,30 @@ void register_kernels(Module& m) {
         softmax_backward(probabilities.view(), temperature, gradient.view(), threads);
       },
       Unlocked());
+  m.def(
+      "project_change",
+      [](Arg parents, Arg held, Arg planted, double stiffness, double smoothness, double standing, Arg change) {
+        project_change(parents.view(), held.view(), planted.view(), stiffness, smoothness, standing, change.view());
+      },
+      Unlocked());
+  m.def(
+      "smooth_bones",
+      [](Arg parents, Arg start, Arg lengths, Arg held, Arg planted, Arg feet, Arg toes, double stiffness,
+         double foot_resistance, double steadiness, double standing, double bone_weight, double damping, double enough,
+         std::int64_t steps, Arg joints) {
+        smooth_bones(parents.view(), start.view(), lengths.view(), held.view(), planted.view(), feet.view(),
+                     toes.view(), {stiffness, foot_resistance, steadiness, standing, bone_weight, damping}, enough,
+                     steps, joints.view());
+      },
+      Unlocked());
+  m.def(
+      "frame_bones",
+      [](Arg parents, Arg lengths, Arg held, Arg planted, Arg feet, double stiffness, double foot_resistance,
+         double standing, double slack, double enough, double longest, std::int64_t steps, Arg joints) {
+        frame_bones(parents.view(), lengths.view(), held.view(), planted.view(), feet.view(),
+                    {stiffness, foot_resistance, 0, standing, 0, 0}, slack, enough, longest, steps, joints.view());
+      },
+      Unlocked());
 }
 
 }  // namespace

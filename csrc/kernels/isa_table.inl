@@ -36,6 +36,10 @@ namespace {
 #include "philox.inl"
 #include "exponential.inl"
 #include "gumbel.inl"
+#include "banded.inl"
+#include "projection.inl"
+#include "smooth_bones.inl"
+#include "frame_bones.inl"
 // clang-format on
 
 template <class T>
@@ -48,7 +52,8 @@ constexpr Kernels<T> kernels() {
 }  // namespace
 
 extern const KernelTable table;
-const KernelTable table = {CONTROLMM_TEXT(CONTROLMM_ISA), kernels<float>(), kernels<double>()};
+const KernelTable table = {CONTROLMM_TEXT(CONTROLMM_ISA), kernels<float>(), kernels<double>(),
+                           {&project, &smooth_bones, &frame_bones}};
 
 }  // namespace CONTROLMM_ISA
 }  // namespace controlmm

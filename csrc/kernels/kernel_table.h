@@ -109,6 +109,38 @@ struct SoftmaxArgs {
   T* gradient;
 };
 
+/// Joints of a clip and the tree of their bones; a parent comes before its children, the root has -1.
+struct BodyTree {
+  std::int64_t frames, joints;
+  const std::int64_t* parents;
+};
+
+// Of the exact mode: one clip in double precision, row-major [frames, joints, 3] or [frames, joints].
+struct ProjectionArgs {
+  BodyTree body;
+  const std::uint8_t *held, *planted;
+  double stiffness, smoothness, standing;
+  double* change;  // wanted where held; written everywhere
+};
+
+struct SmoothBonesArgs {
+  BodyTree body;
+  const double *start, *lengths;
+  const std::uint8_t *held, *planted, *feet, *toes;
+  double stiffness, foot_resistance, steadiness, standing, bone_weight, damping, enough;
+  std::int64_t steps;
+  double* joints;  // the start's, then moved
+};
+
+struct FrameBonesArgs {
+  BodyTree body;
+  const double* lengths;
+  const std::uint8_t *held, *planted, *feet;
+  double stiffness, foot_resistance, standing, slack, enough, longest;
+  std::int64_t steps;
+  double* joints;  // moved in place
+};
+
 /// Half-open range of clips; a clip is never split between threads, so sums keep their order.
 struct ClipRange {
   std::int64_t begin, end;
@@ -127,10 +159,17 @@ struct Kernels {
   void (*guidance)(const GuidanceArgs<T>&, ClipRange, double* scratch);
 };
 
+struct ExactKernels {
+  void (*project)(const ProjectionArgs&, double* scratch);
+  void (*smooth_bones)(const SmoothBonesArgs&, double* scratch);
+  void (*frame_bones)(const FrameBonesArgs&, double* scratch);
+};
+
 struct KernelTable {
   const char* name;
   Kernels<float> f32;
   Kernels<double> f64;
+  ExactKernels exact;
 
   template <class T>
   const Kernels<T>& of() const {
@@ -158,6 +197,25 @@ static constexpr std::int64_t obstacle_scratch(std::int64_t count) { return coun
 /// Doubles of scratch memory for the fused kernel: time series, obstacles, a list of joints, and one flag a joint.
 static constexpr std::int64_t guidance_scratch(const MotionShape& shape, std::int64_t obstacles) {
   return 14 * round_up_to_lanes(shape.frames) + obstacle_scratch(obstacles) + 2 * shape.joints;
+}
+
+/// Doubles of a column of a banded matrix: whole blocks from any of its entries on.
+static constexpr std::int64_t banded_stride(std::int64_t reach) { return round_up_to_lanes(reach + 1) + kLanes; }
+
+/// Doubles of scratch memory for a banded matrix.
+static constexpr std::int64_t banded_scratch(std::int64_t unknowns, std::int64_t reach) {
+  return unknowns * banded_stride(reach);
+}
+
+/// Doubles of scratch memory for a clip's banded system, entries up to `reach` apart, with its right side.
+static constexpr std::int64_t clip_system_scratch(std::int64_t unknowns, std::int64_t reach) {
+  return banded_scratch(unknowns, reach) + unknowns + banded_stride(reach);
+}
+
+/// Doubles of scratch memory for the bones of single frames: how joints yield, bones, a system of bones, a move.
+static constexpr std::int64_t frame_bones_scratch(std::int64_t joints) {
+  return banded_scratch(joints, joints - 1) + 3 * joints * (joints + banded_stride(joints - 1)) + 4 * joints +
+         clip_system_scratch(joints, joints - 1) + 3 * joints;
 }
 
 const KernelTable& active_kernels();

@@ -134,4 +134,33 @@ void gumbel_straight_through(const TensorView& logits, const TensorView& codeboo
 /// @param gradient      Row-major [rows, codes]: on entry the gradient of the probabilities, on return of the logits.
 void softmax_backward(const TensorView& probabilities, double temperature, const TensorView& gradient, int threads = 1);
 
+/// The kernels of the exact mode work on one clip in double precision, in one thread. `parents`: int64 [joints], -1
+/// for the root, which comes first, and parents before their children.
+
+/// What joints resist with and bones pull with; see the Python functions of the same names.
+struct PoseWeights {
+  double stiffness, foot_resistance, steadiness, standing, bone_weight, damping;
+};
+
+/// The smallest smooth change of a clip that moves the held coordinates by what they lack; see `project_change`.
+/// @param held    Boolean [frames, joints, 3]; @param planted boolean [frames, joints].
+/// @param change  Row-major [frames, joints, 3]: in, the change wanted where held; out, the change everywhere.
+void project_change(const TensorView& parents, const TensorView& held, const TensorView& planted, double stiffness,
+                    double smoothness, double standing, const TensorView& change);
+
+/// Bones of the right length, all frames of a clip together.
+/// @param start   Row-major [frames, joints, 3]; @param lengths [joints]; @param feet, toes boolean [joints].
+/// @param enough  Largest error of a bone at which to stop; @param steps at most so many.
+/// @param joints  Row-major [frames, joints, 3]: in, where to begin; out, moved.
+void smooth_bones(const TensorView& parents, const TensorView& start, const TensorView& lengths, const TensorView& held,
+                  const TensorView& planted, const TensorView& feet, const TensorView& toes, const PoseWeights& weights,
+                  double enough, std::int64_t steps, const TensorView& joints);
+
+/// Bones of the right length, each frame for itself.
+/// @param slack   So that a pose out of reach gives the nearest one instead of none.
+/// @param longest Of a coordinate's way in one step.
+void frame_bones(const TensorView& parents, const TensorView& lengths, const TensorView& held,
+                 const TensorView& planted, const TensorView& feet, const PoseWeights& weights, double slack,
+                 double enough, double longest, std::int64_t steps, const TensorView& joints);
+
 }  // namespace controlmm

@@ -10,6 +10,7 @@ from controlmm.ops.backend import (
     use_isa,
 )
 from controlmm.ops.consistency import masked_consistency_loss
+from controlmm.ops.exact import frame_bones, project_change, smooth_bones
 from controlmm.ops.guidance import frames_last, guidance_value_and_grad
 from controlmm.ops.gumbel import gumbel_noise, gumbel_straight_through
 from controlmm.ops.kinematics import recover_joints
@@ -41,6 +42,7 @@ __all__ = [
     "active_isa",
     "available_isas",
     "build_info",
+    "frame_bones",
     "frames_last",
     "guidance_value_and_grad",
     "gumbel_noise",
@@ -48,8 +50,10 @@ __all__ = [
     "masked_consistency_loss",
     "obstacle_loss",
     "pack_obstacles",
+    "project_change",
     "recover_joints",
     "signed_distances",
+    "smooth_bones",
     "use_backend",
     "use_isa",
 ]

@@ -1,0 +1,81 @@
+// Symmetric positive definite systems whose entries lie near the diagonal: A = C D^-1 C^T, column by column. Every
+// element sees its updates in the same order whatever the registers' width, so all instruction sets agree to the bit.
+
+class Banded {
+ public:
+  /// @param memory `banded_scratch(unknowns, reach)` doubles.
+  /// @param reach  Farthest distance of an entry from the diagonal.
+  Banded(double* memory, std::int64_t unknowns, std::int64_t reach)
+      : columns_(memory), count_(unknowns), reach_(reach), stride_(banded_stride(reach)) {
+    clear();
+  }
+
+  void clear() { __builtin_memset(columns_, 0, static_cast<std::size_t>(count_ * stride_) * sizeof(double)); }
+
+  void add(std::int64_t i, std::int64_t j, double value) {
+    const std::int64_t row = i > j ? i : j, col = i > j ? j : i;
+    column(col)[row - col] += value;
+  }
+
+  /// `weight` times the square of `unknown[i] - unknown[j]`, as its share of the matrix.
+  void tie(std::int64_t i, std::int64_t j, double weight) {
+    add(i, i, weight);
+    add(j, j, weight);
+    add(i, j, -weight);
+  }
+
+  /// Fixes the unknowns whose flag is set at what `right` has for them; flag of unknown i: `is_held[i * flag_stride]`.
+  void hold(const std::uint8_t* is_held, std::int64_t flag_stride, double* right) {
+    for (std::int64_t j = 0; j < count_; ++j) {
+      double* col = column(j);
+      const bool held = is_held[j * flag_stride] != 0;
+      for (std::int64_t i = 1; i <= last(j); ++i) {
+        if (col[i] == 0) continue;
+        const bool other = is_held[(j + i) * flag_stride] != 0;
+        if (held && !other) right[j + i] -= col[i] * right[j];
+        if (other && !held) right[j] -= col[i] * right[j + i];
+        if (held || other) col[i] = 0;
+      }
+      if (held) col[0] = 1;
+    }
+  }
+
+  void factorise() {
+    const std::int64_t width = reach_ + 1;
+    for (std::int64_t j = 0; j < count_; ++j) {
+      const double* col = column(j);
+      const double inverse = 1 / col[0];
+      for (std::int64_t i = 1; i <= last(j); ++i)
+        if (col[i] != 0) subtract(column(j + i), col[i] * inverse, col + i, width - i);
+    }
+  }
+
+  /// @param x Right side, then solution; readable for `banded_stride(reach)` doubles past its end, zero there.
+  void solve(double* x) const {
+    for (std::int64_t j = 0; j < count_; ++j) {
+      const double* col = column(j);
+      x[j] /= col[0];
+      if (x[j] != 0)
+        for (std::int64_t i = 1; i <= last(j); ++i) x[j + i] -= col[i] * x[j];
+    }
+    for (std::int64_t j = count_ - 1; j >= 0; --j) x[j] -= dot(column(j) + 1, x + j + 1, reach_) / column(j)[0];
+  }
+
+ private:
+  double* column(std::int64_t j) const { return columns_ + j * stride_; }
+  std::int64_t last(std::int64_t j) const { return reach_ < count_ - 1 - j ? reach_ : count_ - 1 - j; }
+
+  // Whole blocks: what lies past the band is zero in `from`, and nobody's in `to`.
+  static CONTROLMM_INLINE void subtract(double* to, double factor, const double* from, std::int64_t n) {
+    const Lanes<double> f = broadcast(factor);
+    for (std::int64_t k = 0; k < n; k += kLanes) store(to + k, load(to + k) - f * load(from + k));
+  }
+  static CONTROLMM_INLINE double dot(const double* a, const double* b, std::int64_t n) {
+    Lanes<double> total = zeros<double>();
+    for (std::int64_t k = 0; k < n; k += kLanes) total = total + load(a + k) * load(b + k);
+    return sum(total);
+  }
+
+  double* columns_;
+  std::int64_t count_, reach_, stride_;
+};
