@@ -233,14 +233,16 @@ def test_a_file_in_place_of_the_folder_is_refused_before_anything_is_generated(
 def test_a_tolerance_replaces_the_presets(
     command: Command, tiny_pipeline_folder: Path, walk_line: Path, tmp_path: Path
 ) -> None:
-    def error(*options: str) -> float:
-        printed = command(
+    def joints(*options: str) -> torch.Tensor:
+        command(
             "generate", PROMPT, "--controls", walk_line, "--formats", "npz", "--out", tmp_path, "--model",
             tiny_pipeline_folder, *options,
         )  # fmt: skip
-        return float(printed.splitlines()[2].split()[1])
+        return Motion.load(next(tmp_path.glob("*.npz"))).joints
 
-    assert error() == error("--tolerance", "0.003") < error("--tolerance", "1m")
+    as_preset = joints()
+    assert torch.equal(joints("--tolerance", "3cm"), as_preset)
+    assert not torch.equal(joints("--tolerance", "1m"), as_preset)
 
 
 @pytest.mark.parametrize("part", ["tokenizer", "transformer", "residual", "control"])

@@ -13,10 +13,10 @@ from torch import Tensor
 
 from controlmm.evaluation.random_streams import stream_seed
 from controlmm.evaluation.test_set import MAX_FRAMES, Sample
-from controlmm.generation.exact import all_meet_exactly
 from controlmm.generation.one_thread import one_thread
 from controlmm.models.rvq_vae import frame_mask
 from controlmm.ops import recover_joints
+from controlmm.pipelines.closing import close_clips
 from controlmm.pipelines.pipeline import MotionPipeline
 from controlmm.text.encoder import TextEncoder, weights_sha256
 
@@ -148,8 +148,9 @@ class Generated:
         tokens = MAX_FRAMES // pipeline.decoder.downsample
         latents = torch.nn.functional.pad(latents, (0, 0, 0, tokens - latents.shape[1]))
         features = pipeline.decoder.clip_features(latents, frames)
-        if pipeline.wants_exact(self.preset):
-            self._meet_targets(features, batch)
+        if pipeline.closes(self.preset, has_terms=False):
+            mask = batch.mask[..., None].expand_as(batch.joints)
+            close_clips(features, batch.joints, mask, batch.lengths.tolist(), pipeline.skeleton)
         seconds = time.perf_counter() - started
         # Beyond the clips: what the decoder makes of empty tokens, as in the published evaluation.
         padding = pipeline.decoder.features(latents)
@@ -171,15 +172,3 @@ class Generated:
             seeds=batch.noise_seeds,
             preset=preset,
         )
-
-    def _meet_targets(self, features: Float[Tensor, "B T D"], batch: Batch) -> None:
-        """The pipeline's exact mode for each clip that has targets, in place."""
-        mask = batch.mask[..., None].expand_as(batch.joints)
-        rows = batch.mask.flatten(1).any(1).nonzero()[:, 0].tolist()
-        lengths = batch.lengths.tolist()
-        clips = []
-        for row in rows:
-            frames = slice(lengths[row])
-            clips.append((features[row, frames], batch.joints[row, frames], mask[row, frames]))
-        for row, (met, _) in zip(rows, all_meet_exactly(clips, self.pipeline.skeleton), strict=True):
-            features[row, : lengths[row]] = met

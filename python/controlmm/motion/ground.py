@@ -17,12 +17,17 @@ def grounded(features: Float[Tensor, "*B T D"]) -> Float[Tensor, "*B T D"]:
     """
     layout = feature_layout(skeleton_of_width(features.shape[-1]))
     root, joints = features[..., layout.root_height], features[..., layout.local_positions]
-    joints = joints.unflatten(-1, (-1, 3))
-    heights = joints[..., 1]  # (..., T, J-1)
+    heights = joints.unflatten(-1, (-1, 3))[..., 1]  # (..., T, J-1)
     lowest = heights.flatten(-2).amin(-1).minimum(root.flatten(-2).amin(-1))
+    return lifted(features, -lowest)
+
+
+def lifted(features: Float[Tensor, "*B T D"], rise: Float[Tensor, "*B"]) -> Float[Tensor, "*B T D"]:
+    """De-normalised features moved up by ``rise``, in the skeleton's unit; only heights change."""
+    layout = feature_layout(skeleton_of_width(features.shape[-1]))
     moved = features.clone()
-    moved[..., layout.root_height] = root - lowest[..., None, None]
-    joints = joints.clone()
-    joints[..., 1] = heights - lowest[..., None, None]
+    moved[..., layout.root_height] += rise[..., None, None]
+    joints = moved[..., layout.local_positions].unflatten(-1, (-1, 3)).clone()
+    joints[..., 1] += rise[..., None, None]
     moved[..., layout.local_positions] = joints.flatten(-2)
     return moved

@@ -7,12 +7,20 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from controlmm.controls import Control, densify
 from controlmm.generation.control_residuals import ControlResiduals
 from controlmm.generation.solvers import Stopping, gauss_newton
+from controlmm.motion.ground import lifted
+from controlmm.motion.layout import feature_layout
+from controlmm.motion.skeleton import skeleton_of_width
+from controlmm.ops import recover_joints
+from controlmm.pipelines.closing import close_clips
 from controlmm.pipelines.output import GenerationResult
 from controlmm.pipelines.placement import moved
+from controlmm.pipelines.reach import check_reach
 from controlmm.pipelines.scene import Scene
 
 if TYPE_CHECKING:
@@ -35,6 +43,7 @@ def adjusted(
     motion = result.motions[0]
     frames, skeleton = motion.num_frames, decoder.normalizer.skeleton
     dense = densify(controls, frames, skeleton)
+    reached = check_reach(dense, skeleton, is_strict=False)
     origin = motion.joints[0, 0] * motion.joints.new_tensor([1, 0, 1])
     scene = Scene(motion.text, frames, dense, origin)
     canonical, count = moved(dense, -origin), len(result)
@@ -56,8 +65,49 @@ def adjusted(
     stopping = Stopping(iterations=_ITERATIONS, error=tolerance)
     solution = gauss_newton(residuals, result.latents, keep, stopping)
     features = decoder.clip_features(solution.latents)[:, :frames]
-    features[:, :hold_frames] = decoder.clip_features(result.latents)[:, :hold_frames]
-    return scene.result(features, solution.latents, seconds_taken=time.perf_counter() - started)
+    held = _held_features(result, hold_frames) if hold_frames else features[:, :0]
+    if hold_frames and scene.stands_on_floor:  # as high above the ground as what is held
+        features = lifted(features, _rise(held, decoder.clip_features(result.latents)))
+    features[:, :hold_frames] = held
+    wanted, within = targets[:, :frames].clone(), mask[:, :frames] & reached[:, None, None]
+    wanted[:, :hold_frames] = recover_joints(held, joints=skeleton.num_joints)
+    within[:, :hold_frames] = True
+    reports = close_clips(features, wanted, within, [frames] * count, skeleton)
+    _hold(features, held)
+    return scene.result(
+        features,
+        solution.latents,
+        seconds_taken=time.perf_counter() - started,
+        on_floor=scene.stands_on_floor and not hold_frames,
+        exact=reports,
+    )
+
+
+def _held_features(result: GenerationResult, frames: int) -> Float[Tensor, "S H D"]:
+    """Of the first frames as they were returned."""
+    clips = []
+    for motion in result:
+        assert motion.features is not None  # of every motion that a call returns
+        clips.append(motion.features[:frames])
+    return torch.stack(clips)
+
+
+def _hold(features: Float[Tensor, "S T D"], held: Float[Tensor, "S H D"]) -> None:
+    """The held frames to the bit; but the velocities of the last one lead to the first that may move."""
+    layout, frames = feature_layout(skeleton_of_width(held.shape[-1])), held.shape[1]
+    ways = (layout.root_yaw_velocity, layout.root_velocity, layout.joint_velocities)
+    onwards = [features[:, frames - 1 : frames, way].clone() for way in ways]
+    features[:, :frames] = held
+    if frames:
+        for way, velocities in zip(ways, onwards, strict=True):
+            features[:, frames - 1 : frames, way] = velocities
+
+
+def _rise(held: Float[Tensor, "S H D"], decoded: Float[Tensor, "S T D"]) -> Float[Tensor, "S"]:
+    """How much higher the root is than decoded; closing has moved it by millimetres, so the middle frame's."""
+    height = feature_layout(skeleton_of_width(held.shape[-1])).root_height
+    rises: Tensor = (held - decoded[:, : held.shape[1]])[..., height].flatten(1).median(1).values
+    return rises
 
 
 def _check(result: GenerationResult, *, hold_frames: int, tolerance: float) -> None:

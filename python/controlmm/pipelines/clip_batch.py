@@ -134,9 +134,10 @@ def _edited(
         terms=clips.terms,
     )
     drawn = drawn_latents(pipeline, clips.request(pipeline, preset, progress), objective, branch, preset)
-    drawn = with_steps(objective, drawn, clips.valid, preset.budget, progress=progress)
+    budget = preset.latent_budget(has_terms=bool(clips.terms))
+    drawn = with_steps(objective, drawn, clips.valid, budget, progress=progress)
     keep = clips.valid[..., None].float()
-    return edit_latents(objective, drawn, keep, preset.budget, progress=progress).latents
+    return edit_latents(objective, drawn, keep, budget, progress=progress).latents
 
 
 def share_count(preset: Preset, terms: Sequence[JointTerm]) -> int:

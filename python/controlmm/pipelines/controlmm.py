@@ -195,12 +195,13 @@ class ControlMM(MotionPipeline[Preset]):
         controls: Sequence[Control],
         *,
         hold_frames: int = 0,
-        tolerance: float = 0.003,
+        tolerance: float = 0.02,
     ) -> GenerationResult:
         """Move the targets of a result and solve again from where it stands: for dragging a target about.
 
         No network but the decoder runs, and motions change least, so that what the new targets leave alone
-        stays. Targets are met to ``tolerance`` or as well as 40 steps can.
+        stays. Latents are edited to ``tolerance`` or as well as 40 steps can, then joints are put on their
+        targets, and bones get their lengths.
 
         Args:
             result: What a call or an earlier :meth:`adjust` returned.
@@ -217,9 +218,17 @@ class ControlMM(MotionPipeline[Preset]):
         """
         return adjusted(self.decoder, result, controls, hold_frames=hold_frames, tolerance=tolerance)
 
-    def wants_exact(self, plan: Preset) -> bool:
+    def closes(self, plan: Preset, *, has_terms: bool) -> bool:
+        """See :class:`MotionPipeline`."""
+        return plan.closes(has_terms=has_terms)
+
+    def is_exact(self, plan: Preset) -> bool:
         """See :class:`MotionPipeline`."""
         return plan.is_exact
+
+    def inexact(self, preset: str | Preset, guidance_scale: float | None) -> Preset:
+        """See :class:`MotionPipeline`. Latents then do all: timelines, chains and edits have no closed end."""
+        return replace(super().inexact(preset, guidance_scale), closes_from=None)
 
     def limited(
         self,

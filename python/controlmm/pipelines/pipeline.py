@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controlmm.controls import Avoid, Control, Objective, Obstacle, TimelineEntry
-from controlmm.generation.exact import ExactReport, all_meet_exactly
+from controlmm.generation.exact import ExactReport
 from controlmm.generation.noise import clip_seeds
 from controlmm.generation.one_thread import one_thread
 from controlmm.generation.solvers import Progress
@@ -21,6 +21,7 @@ from controlmm.generation.terms import JointTerm
 from controlmm.models.length_estimator import LengthEstimator
 from controlmm.pipelines.chaining import run_chain
 from controlmm.pipelines.checks import check_sampling
+from controlmm.pipelines.closing import close_clips
 from controlmm.pipelines.length import draw_frames
 from controlmm.pipelines.output import GenerationResult
 from controlmm.pipelines.pretrained import PretrainedPipeline
@@ -159,31 +160,34 @@ class MotionPipeline(PretrainedPipeline, ABC, Generic[_Plan]):
             arrange(seconds=None, frames=MAX_FRAMES)  # an unusable call is refused before any network runs
             frames = self._drawn_frames(self.length, prompt, controls, seed)
         scene = arrange(seconds=seconds, frames=frames)
-        is_exact = self.wants_exact(plan)
-        check_reach(scene.controls, self.skeleton, is_strict=is_exact)
+        reached = check_reach(scene.controls, self.skeleton, is_strict=self.is_exact(plan))
         canonical = scene.canonical
+        targets, mask = (x.expand(samples, -1, -1, -1) for x in (canonical.targets, canonical.mask))
+        terms = scene.terms(samples, padded=self.padded_frames(scene.frames), skeleton=self.skeleton)
         latents = self.generate_latents(
             self.text_encoder.encode([scene.prompt]).pooled.expand(samples, -1),
             lengths=[scene.frames] * samples,
-            targets=canonical.targets.expand(samples, -1, -1, -1),
-            mask=canonical.mask.expand(samples, -1, -1, -1),
+            targets=targets,
+            mask=mask,
             seeds=clip_seeds(seed, samples),
             preset=plan,
-            terms=scene.terms(samples, padded=self.padded_frames(scene.frames), skeleton=self.skeleton),
+            terms=terms,
             progress=progress,
         )
         features = self.decoder.clip_features(latents)[:, : scene.frames]
-        reports: list[ExactReport] = []
-        if is_exact:
-            clips = [(edited, canonical.targets, canonical.mask) for edited in features]
-            for clip, (met, report) in enumerate(all_meet_exactly(clips, self.skeleton)):
-                features[clip] = met
-                reports.append(report)
+        reports: tuple[ExactReport, ...] = ()
+        if self.closes(plan, has_terms=bool(terms)):
+            within = mask & reached[:, None, None]
+            reports = close_clips(features, targets, within, [scene.frames] * samples, self.skeleton)
         seconds_taken = time.perf_counter() - started
-        return scene.result(features, latents, seconds_taken=seconds_taken, exact=tuple(reports))
+        return scene.result(features, latents, seconds_taken=seconds_taken, exact=reports)
 
-    def wants_exact(self, plan: _Plan) -> bool:  # noqa: ARG002 (for subclasses)
-        """Whether joints are moved onto their targets after editing."""
+    def closes(self, plan: _Plan, *, has_terms: bool) -> bool:  # noqa: ARG002 (for subclasses)
+        """Whether joints are put on their targets after editing, and bones get their lengths."""
+        return False
+
+    def is_exact(self, plan: _Plan) -> bool:  # noqa: ARG002 (for subclasses)
+        """Whether targets that bones cannot span are refused."""
         return False
 
     def inexact(self, preset: str | _Plan, guidance_scale: float | None) -> _Plan:
@@ -194,7 +198,7 @@ class MotionPipeline(PretrainedPipeline, ABC, Generic[_Plan]):
             ValueError: If there is none of that name, or it is to be exact.
         """
         plan = self.resolve_preset(preset, guidance_scale)
-        if self.wants_exact(plan):
+        if self.is_exact(plan):
             raise ValueError(
                 "`preset` 'exact' makes single motions from controls; `timeline`, `chain` and `edit` cannot. "
                 "Use 'accurate'."

@@ -13,7 +13,7 @@ from controlmm.ops.consistency import NORM_CODES, Norm
 
 _LENGTHS = {"m": 1.0, "mm": 0.001, "cm": 0.01}
 _TIMES = {"s": 1.0, "ms": 0.001}
-_STEPS = 6  # of masked decoding: on validation clips no worse than the papers' ten (docs/solvers.md)
+_FEW_STEPS = 6  # of masked decoding; on validation clips no worse than the papers' ten (docs/solvers.md)
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,10 @@ class Preset:
     guided_share: float | None = None  # of the steps, the first ones
     control_norm: Norm = "mse"  # of the distance that editing minimises: published code; the paper: "l2"
     rules: DecodingRules = field(default_factory=DecodingRules)
-    is_exact: bool = (
-        False  # after editing, move the joints onto their targets; see controlmm.generation.exact
-    )
+    # Metres: latents are edited until so near, then joints are put on their targets in closed form, and bones get
+    # their lengths (controlmm.generation.exact). None: latents as near as the budget says, and nothing after them.
+    closes_from: float | None = None
+    is_exact: bool = False  # what bones cannot span is refused, and obstacles do not keep joints off targets
     is_bfloat16: bool = False  # networks that draw tokens multiply in bfloat16 where the processor has AMX
 
     def __post_init__(self) -> None:
@@ -45,12 +46,35 @@ class Preset:
         share = self.guided_share
         if share is not None and not (isinstance(share, int | float) and 0 <= share <= 1):
             raise ValueError(f"`guided_share` must be from 0 to 1, got {share!r}.")
+        near = self.closes_from
+        if near is not None and not (isinstance(near, int | float) and 0 < near < math.inf):
+            raise ValueError(f"`closes_from` must be a positive number of metres or None, got {near!r}.")
+        if self.is_exact and near is None:
+            raise ValueError("`is_exact` needs `closes_from`: joints come onto targets in closed form.")
+
+    def closes(self, *, has_terms: bool) -> bool:
+        """Whether joints are put on their targets at the end; ``has_terms``: beside obstacles or objectives, which
+        nobody watches then.
+        """
+        return self.closes_from is not None and (self.is_exact or not has_terms)
+
+    def latent_budget(self, *, has_terms: bool) -> EditingBudget:
+        """Of the latents: until it is near enough, if the rest is done in closed form."""
+        if has_terms or not self.closes(has_terms=has_terms):
+            return self.budget
+        return replace(self.budget, tolerance=self.closes_from)
 
 
-def _ours(iterations: int, tolerance: float, *, is_exact: bool = False) -> Preset:
-    """Editing until a tolerance, with naturalness."""
+def _quick(iterations: int, tolerance: float, *, near: float) -> Preset:
+    """Editing with naturalness until ``near`` and a closed end, or until ``tolerance`` where there is none."""
     budget = EditingBudget(solver="auto", latent_iterations=iterations, tolerance=tolerance, naturalness=1.0)
-    return Preset(budget, steps=_STEPS, is_exact=is_exact, is_bfloat16=True)
+    return Preset(budget, steps=_FEW_STEPS, closes_from=near, is_bfloat16=True)
+
+
+def _thorough(iterations: int, tolerance: float, *, near: float, is_exact: bool = False) -> Preset:
+    """The same, but tokens are drawn as in the papers."""
+    quick = _quick(iterations, tolerance, near=near)
+    return replace(quick, steps=10, guided_share=1.0, is_exact=is_exact)
 
 
 def _papers(*, logits: int = 0, codebook: int) -> Preset:
@@ -60,10 +84,10 @@ def _papers(*, logits: int = 0, codebook: int) -> Preset:
 
 # `python -m benchmarks.editing` measures them. The papers' iteration counts are there to compare with.
 PRESETS = {
-    "fast": _ours(20, 0.01),
-    "balanced": _ours(40, 0.003),
-    "accurate": _ours(80, 0.001),
-    "exact": _ours(80, 0.001, is_exact=True),
+    "fast": _quick(20, 0.01, near=0.05),
+    "balanced": _quick(40, 0.003, near=0.03),
+    "accurate": _thorough(80, 0.001, near=0.02),
+    "exact": _thorough(80, 0.001, near=0.01, is_exact=True),
     "paper-fast": _papers(codebook=100),
     "paper-medium": _papers(codebook=600),
     "paper-accurate": _papers(logits=100, codebook=600),
@@ -111,7 +135,7 @@ def with_limits(
 
     Args:
         plan: A preset.
-        tolerance: Control error at which a clip is done, in metres or with a unit: ``"1mm"``, ``"2 cm"``.
+        tolerance: Control error at which latents are left, in metres or with a unit: ``"1mm"``, ``"2 cm"``.
         time_budget: Time for the editing of latents, in seconds or with a unit: ``"200ms"``.
         naturalness: Strength of the terms that keep editing natural; 0 leaves them out.
 
@@ -121,11 +145,13 @@ def with_limits(
     budget = plan.budget
     if naturalness is not None:
         budget = replace(budget, naturalness=_strength(naturalness))
+    near = plan.closes_from
     if tolerance is not None:
-        budget = replace(budget, tolerance=quantity("tolerance", tolerance, _LENGTHS))
+        metres = quantity("tolerance", tolerance, _LENGTHS)
+        budget, near = replace(budget, tolerance=metres), None if near is None else metres
     if time_budget is not None:
         budget = replace(budget, time_budget=quantity("time_budget", time_budget, _TIMES))
-    return replace(plan, budget=budget)
+    return replace(plan, budget=budget, closes_from=near)
 
 
 def _strength(value: float) -> float:

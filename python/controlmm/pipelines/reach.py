@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controlmm.controls import DenseControls
@@ -14,8 +14,10 @@ from controlmm.motion.skeleton import Skeleton
 _SLACK = 0.02  # share of the reach: bodies of the data differ a little from the skeleton's
 
 
-def check_reach(controls: DenseControls, skeleton: Skeleton, *, is_strict: bool) -> None:
-    """Warn of targets that bones cannot span, or refuse them.
+def check_reach(
+    controls: DenseControls, skeleton: Skeleton, *, is_strict: bool
+) -> Bool[Tensor, "T"]:
+    """Frames whose targets bones can span; a warning if there are others, or refusal.
 
     Args:
         controls: One clip's targets; distances are measured along the axes that both joints have.
@@ -25,11 +27,12 @@ def check_reach(controls: DenseControls, skeleton: Skeleton, *, is_strict: bool)
     Raises:
         ValueError: If ``is_strict`` and a pair of targets is out of reach.
     """
+    reached = torch.ones(len(controls.mask), dtype=torch.bool)
     if skeleton.bone_lengths is None:
-        return
-    worst = _worst_pair(controls, chain_lengths(skeleton))
+        return reached
+    worst = _worst_pair(controls, chain_lengths(skeleton), reached)
     if worst is None:
-        return
+        return reached
     frame, first, second, distance, reach = worst
     names = skeleton.joint_names
     text = (
@@ -40,6 +43,7 @@ def check_reach(controls: DenseControls, skeleton: Skeleton, *, is_strict: bool)
     if is_strict:
         raise ValueError(text)
     warnings.warn(text + " The motion will come as near as it can.", stacklevel=4)
+    return reached
 
 
 def chain_lengths(skeleton: Skeleton) -> Float[Tensor, "J J"]:
@@ -56,9 +60,12 @@ def chain_lengths(skeleton: Skeleton) -> Float[Tensor, "J J"]:
 
 
 def _worst_pair(
-    controls: DenseControls, reach: Float[Tensor, "J J"]
+    controls: DenseControls, reach: Float[Tensor, "J J"], reached: Bool[Tensor, "T"]
 ) -> tuple[int, int, int, float, float] | None:
-    """Frame, two joints, their distance and their reach, where the excess is largest."""
+    """Frame, two joints, their distance and their reach, where the excess is largest.
+
+    Clears ``reached`` in every frame with an excess.
+    """
     targets, mask = controls.targets.double(), controls.mask
     used = mask.any(-1).any(0).nonzero()[:, 0].tolist()
     worst, excess = None, 0.0
@@ -67,7 +74,9 @@ def _worst_pair(
             both = mask[:, first] & mask[:, second]
             distance = ((targets[:, first] - targets[:, second]) * both).norm(dim=-1)
             limit = reach[first, second].item()
-            beyond, frame = (distance - limit * (1 + _SLACK)).max(0)
+            excesses = distance - limit * (1 + _SLACK)
+            reached &= excesses <= 0
+            beyond, frame = excesses.max(0)
             if beyond > excess:
                 excess = beyond.item()
                 worst = int(frame), first, second, distance[frame].item(), limit
