@@ -25,6 +25,7 @@ from controlmm.evaluation.protocol import Protocol, batches_of
 from controlmm.evaluation.test_set import read_test_set
 from controlmm.generation.noise import clip_seeds
 from controlmm.pipelines import Preset
+from controlmm.pipelines.closing import close_clips
 
 FRAMES, LENGTH, BEND = 196, 8.0, 0.6  # of the path: frames, metres forward, metres to each side
 ALONE = 8  # clips that are made one at a time
@@ -70,7 +71,10 @@ class Clips:
             seeds=[self.seeds[row] for row in rows],
             preset=preset,
         )
-        return pipeline.decoder.clip_features(latents)
+        features = pipeline.decoder.clip_features(latents)[:, : max(lengths)]
+        if preset.closes(has_terms=False):
+            close_clips(features, self.targets[rows], self.mask[rows], lengths, pipeline.skeleton)
+        return features
 
 
 def seconds_of(work: Callable[[], object], threads: int) -> tuple[float, float]:

@@ -26,9 +26,10 @@ from controlmm.generation.objective import ControlObjective
 from controlmm.models.rvq_vae import frame_mask
 from controlmm.pipelines import PRESETS, Preset
 
-UNEDITED = replace(PRESETS["accurate"], budget=EditingBudget(latent_iterations=0))
+UNEDITED = replace(PRESETS["accurate"], budget=EditingBudget(latent_iterations=0), closes_from=None)
 PLANS: dict[str, Preset] = {
     "unedited": UNEDITED,
+    "latents alone": replace(PRESETS["accurate"], closes_from=None),
     "gauss-newton": PRESETS["accurate"],
     "exact": PRESETS["exact"],
     "lbfgs": replace(PRESETS["accurate"], budget=replace(PRESETS["accurate"].budget, solver="lbfgs")),
@@ -36,15 +37,17 @@ PLANS: dict[str, Preset] = {
     "paper-accurate": PRESETS["paper-accurate"],
 }
 REAL = "recorded"
+_TRIALS = 5  # of a plain evaluation
 
 
 @dataclass(frozen=True)
 class Edited:
-    """A clip after editing: features (T, D), processor seconds of the editing alone, evaluations."""
+    """A clip after editing: features (T, D), processor seconds of the editing alone, its end included."""
 
     features: Tensor
     seconds: float
     evaluations: int
+    worth: float  # of the seconds, in plain evaluations of the same clip
 
 
 class Bench:
@@ -62,7 +65,6 @@ class Bench:
         self.pipeline, self.evaluator = pipeline, evaluator
         self.test_set, self.protocol, self._slow_limit = test_set, protocol, slow_limit
         self._drawn: dict[tuple[ControlSetting, int], Tensor] = {}
-        self._solved: dict[tuple[ControlSetting, int, int, EditingBudget], tuple[Tensor, float, int]] = {}
 
     def row(self, solver: str, setting: ControlSetting) -> Row:
         """Scores of one solver. Errors, seconds and evaluations are medians over clips, the rest means."""
@@ -90,6 +92,7 @@ class Bench:
             "worst_cm": 100 * errors.max().item(),
             "seconds": _median([clip.seconds for clip in clips]),
             "evaluations": _median([float(clip.evaluations) for clip in clips]),
+            "worth": _median([clip.worth for clip in clips]),
             **{name: scores[name] for name in ("fid", "r3", "mm_distance", "skating", "jerk")},
             "bones_mm": 1000 * scores["bone_deviation"],
             "clips": len(errors),
@@ -108,7 +111,7 @@ class Bench:
             latents = self._drawn[place]
         share = (time.thread_time() - began) / len(latents) if in_logits else 0.0
         return [
-            self._clip(plan, batch, (*place, clip), latents[clip : clip + 1], share, in_logits)
+            self._clip(plan, batch, clip, latents[clip : clip + 1], share, in_logits)
             for clip in range(len(latents))
         ]
 
@@ -129,29 +132,38 @@ class Bench:
         self,
         plan: Preset,
         batch: Batch,
-        place: tuple[ControlSetting, int, int],
+        clip: int,
         latents: Tensor,
         seconds: float,
         evaluations: int,
     ) -> Edited:
-        clip, decoder = place[2], self.pipeline.decoder
+        decoder = self.pipeline.decoder
         length = int(batch.lengths[clip])
         latents = latents[:, : length // decoder.downsample]
         targets = batch.joints[clip : clip + 1, :length]
         mask = batch.mask[clip : clip + 1, :length, :, None].expand_as(targets)
         objective = ControlObjective(decoder, targets, mask, frame_mask(torch.tensor([length]), length))
-        if plan.budget.latent_iterations:
-            key = (*place, plan.budget)
-            if key not in self._solved:  # the exact mode goes on from what Gauss-Newton found
-                self._solved = {known: found for known, found in self._solved.items() if known[0] == place[0]}
-                self._solved[key] = _solved(objective, latents, plan.budget)
-            latents, taken, count = self._solved[key]
+        plain = _plain_seconds(objective, latents)
+        budget = plan.latent_budget(has_terms=False)
+        if budget.latent_iterations:
+            latents, taken, count = _solved(objective, latents, budget)
             seconds, evaluations = seconds + taken, evaluations + count
         began = time.thread_time()
         features = decoder.features(latents)[0]
-        if plan.is_exact:
+        if plan.closes(has_terms=False):
             features, _ = meet_exactly(features, targets[0], mask[0], self.pipeline.skeleton)
-        return Edited(features, seconds + time.thread_time() - began, evaluations)
+        seconds += time.thread_time() - began
+        return Edited(features, seconds, evaluations, seconds / plain)
+
+
+def _plain_seconds(objective: ControlObjective, latents: Tensor) -> float:
+    """Processor seconds of one evaluation, value and gradient: the median of a few."""
+    taken = []
+    for _ in range(_TRIALS):
+        began = time.thread_time()
+        objective.value_and_gradient(latents)
+        taken.append(time.thread_time() - began)
+    return _median(taken)
 
 
 def _solved(objective: ControlObjective, latents: Tensor, budget: EditingBudget) -> tuple[Tensor, float, int]:

@@ -60,7 +60,13 @@ def project_change(
         return project_change_reference(change, held, planted, parents)
     result = change.clone(memory_format=torch.contiguous_format)
     core().project_change(
-        torch.tensor(parents), held.contiguous(), planted.contiguous(), STIFFNESS, SMOOTHNESS, STANDING, result
+        torch.tensor(parents),
+        held.contiguous(),
+        planted.contiguous(),
+        STIFFNESS,
+        SMOOTHNESS,
+        STANDING,
+        result,
     )
     return result
 
@@ -188,7 +194,9 @@ def _check_clip(name: str, clip: Tensor, held: Tensor, planted: Tensor, parents:
             raise ValueError(
                 f"`{other}` must be boolean of shape {tuple(shape)}, got {flags.dtype} of {tuple(flags.shape)}."
             )
-    if any((parent >= joint if joint else parent != -1) or parent < -1 for joint, parent in enumerate(parents)):
+    if any(
+        (parent >= joint if joint else parent != -1) or parent < -1 for joint, parent in enumerate(parents)
+    ):
         raise ValueError(
             f"`parents` must be -1 for the first joint and name an earlier joint for every other, got {parents}."
         )

@@ -27,9 +27,7 @@ def close_clips(
         lengths: Frames of each clip.
         skeleton: Whose bones.
     """
-    clips = [
-        (features[row, :end], targets[row, :end], mask[row, :end]) for row, end in enumerate(lengths)
-    ]
+    clips = [(features[row, :end], targets[row, :end], mask[row, :end]) for row, end in enumerate(lengths)]
     reports = []
     for row, (met, report) in enumerate(all_meet_exactly(clips, skeleton)):
         features[row, : lengths[row]] = met

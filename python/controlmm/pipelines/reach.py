@@ -14,9 +14,7 @@ from controlmm.motion.skeleton import Skeleton
 _SLACK = 0.02  # share of the reach: bodies of the data differ a little from the skeleton's
 
 
-def check_reach(
-    controls: DenseControls, skeleton: Skeleton, *, is_strict: bool
-) -> Bool[Tensor, "T"]:
+def check_reach(controls: DenseControls, skeleton: Skeleton, *, is_strict: bool) -> Bool[Tensor, "T"]:
     """Frames whose targets bones can span; a warning if there are others, or refusal.
 
     Args:
