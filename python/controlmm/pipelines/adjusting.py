@@ -93,7 +93,7 @@ def _held_features(result: GenerationResult, frames: int) -> Float[Tensor, "S H 
 
 
 def _hold(features: Float[Tensor, "S T D"], held: Float[Tensor, "S H D"]) -> None:
-    """The held frames to the bit; but the velocities of the last one lead to the first that may move."""
+    """The held frames to the bit; but velocities of the last one lead to the first that may move."""
     layout, frames = feature_layout(skeleton_of_width(held.shape[-1])), held.shape[1]
     ways = (layout.root_yaw_velocity, layout.root_velocity, layout.joint_velocities)
     onwards = [features[:, frames - 1 : frames, way].clone() for way in ways]

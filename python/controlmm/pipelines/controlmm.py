@@ -227,7 +227,7 @@ class ControlMM(MotionPipeline[Preset]):
         return plan.is_exact
 
     def inexact(self, preset: str | Preset, guidance_scale: float | None) -> Preset:
-        """See :class:`MotionPipeline`. Latents then do all: timelines, chains and edits have no closed end."""
+        """See :class:`MotionPipeline`; latents do all, timelines, chains and edits have no closed end."""
         return replace(super().inexact(preset, guidance_scale), closes_from=None)
 
     def limited(

@@ -27,8 +27,8 @@ class Preset:
     guided_share: float | None = None  # of the steps, the first ones
     control_norm: Norm = "mse"  # of the distance that editing minimises: published code; the paper: "l2"
     rules: DecodingRules = field(default_factory=DecodingRules)
-    # Metres: latents are edited until so near, then joints are put on their targets in closed form, and bones get
-    # their lengths (controlmm.generation.exact). None: latents as near as the budget says, and nothing after them.
+    # Metres: latents are edited until so near, then joints are put on their targets in closed form, and bones
+    # get their lengths (controlmm.generation.exact). None: latents as near as the budget says, nothing after.
     closes_from: float | None = None
     is_exact: bool = False  # what bones cannot span is refused, and obstacles do not keep joints off targets
     is_bfloat16: bool = False  # networks that draw tokens multiply in bfloat16 where the processor has AMX
@@ -53,8 +53,9 @@ class Preset:
             raise ValueError("`is_exact` needs `closes_from`: joints come onto targets in closed form.")
 
     def closes(self, *, has_terms: bool) -> bool:
-        """Whether joints are put on their targets at the end; ``has_terms``: beside obstacles or objectives, which
-        nobody watches then.
+        """Whether joints are put on their targets at the end.
+
+        ``has_terms``: beside obstacles or objectives, which nobody watches then.
         """
         return self.closes_from is not None and (self.is_exact or not has_terms)
 
@@ -66,7 +67,7 @@ class Preset:
 
 
 def _quick(iterations: int, tolerance: float, *, near: float) -> Preset:
-    """Editing with naturalness until ``near`` and a closed end, or until ``tolerance`` where there is none."""
+    """Editing with naturalness until ``near`` and a closed end; until ``tolerance`` where there is none."""
     budget = EditingBudget(solver="auto", latent_iterations=iterations, tolerance=tolerance, naturalness=1.0)
     return Preset(budget, steps=_FEW_STEPS, closes_from=near, is_bfloat16=True)
 

@@ -64,4 +64,5 @@ def _turned_along(
         moved = turns[:, bones] @ old
         turned[:, bones] = new.mT @ moved @ own.mT @ columns[:, bones]
         new = moved
-    return turned.mT.flatten(1)
+    result: Tensor = turned.mT.flatten(1)
+    return result
