@@ -71,7 +71,7 @@ inline bool restore_step(const FrameBonesArgs& args, const Yielding& yields, dou
     bone[b] = bone_of(frame, b + 1, body.parents[b + 1]);
     forces[b] = args.lengths[b + 1] - bone[b].length;
     const double error = std::fabs(forces[b]);
-    if (!(error <= worst)) worst = error;
+    if (error > worst || error != error) worst = error;  // one that is no number stays
   }
   if (worst < args.enough) return true;
   for (std::int64_t i = 0; i < banded_stride(bones - 1); ++i) forces[bones + i] = 0;

@@ -52,8 +52,8 @@ constexpr Kernels<T> kernels() {
 }  // namespace
 
 extern const KernelTable table;
-const KernelTable table = {CONTROLMM_TEXT(CONTROLMM_ISA), kernels<float>(), kernels<double>(),
-                           {&project, &smooth_bones, &frame_bones}};
+const KernelTable table = {
+    CONTROLMM_TEXT(CONTROLMM_ISA), kernels<float>(), kernels<double>(), {&project, &smooth_bones, &frame_bones}};
 
 }  // namespace CONTROLMM_ISA
 }  // namespace controlmm

@@ -21,9 +21,8 @@ inline double worst_bone(const BodyTree& body, const double* joints, const doubl
   double worst = 0;
   for (std::int64_t t = 0; t < frames; ++t)
     for (std::int64_t j = 1; j < body.joints; ++j) {
-      const double error =
-          std::fabs(lengths[j] - bone_of(joints + 3 * t * body.joints, j, body.parents[j]).length);
-      if (!(error <= worst)) worst = error;
+      const double error = std::fabs(lengths[j] - bone_of(joints + 3 * t * body.joints, j, body.parents[j]).length);
+      if (error > worst || error != error) worst = error;  // one that is no number stays
     }
   return worst;
 }
@@ -89,7 +88,7 @@ inline void smooth_bones(const SmoothBonesArgs& args, double* memory) {
   Banded system(memory, count, reach);
   double* step = memory + banded_scratch(count, reach);
   for (std::int64_t n = 0; n < args.steps; ++n) {
-    if (worst_bone(body, args.joints, args.lengths, body.frames) <= args.enough) return;
+    if (!(worst_bone(body, args.joints, args.lengths, body.frames) > args.enough)) return;
     if (n > 0) system.clear();
     for (std::int64_t i = 0; i < count + banded_stride(reach); ++i) step[i] = 0;
     for (std::int64_t t = 0; t < body.frames; ++t) add_frame(args, t, system, step);

@@ -18,8 +18,10 @@ BodyTree body_tree(const TensorView& parents, const TensorView& joints, const ch
   for (std::int64_t j = 0; j < body.joints; ++j) {
     const bool fits = j == 0 ? body.parents[j] == -1 : body.parents[j] >= 0 && body.parents[j] < j;
     if (!fits)
-      throw std::invalid_argument("`parents` must name an earlier joint for every joint but the first, which has -1, "
-                                  "got " + std::to_string(body.parents[j]) + " for joint " + std::to_string(j) + ".");
+      throw std::invalid_argument(
+          "`parents` must name an earlier joint for every joint but the first, which has -1, "
+          "got " +
+          std::to_string(body.parents[j]) + " for joint " + std::to_string(j) + ".");
   }
   return body;
 }

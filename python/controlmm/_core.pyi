@@ -107,3 +107,48 @@ def gumbel_straight_through(
 def softmax_backward(
     probabilities: _Array, temperature: float, gradient: _Array, threads: int, /
 ) -> None: ...
+def project_change(
+    parents: _Array,
+    held: _Array,
+    planted: _Array,
+    stiffness: float,
+    smoothness: float,
+    standing: float,
+    change: _Array,
+    /,
+) -> None: ...
+def smooth_bones(
+    parents: _Array,
+    start: _Array,
+    lengths: _Array,
+    held: _Array,
+    planted: _Array,
+    feet: _Array,
+    toes: _Array,
+    stiffness: float,
+    foot_resistance: float,
+    steadiness: float,
+    standing: float,
+    bone_weight: float,
+    damping: float,
+    enough: float,
+    steps: int,
+    joints: _Array,
+    /,
+) -> None: ...
+def frame_bones(
+    parents: _Array,
+    lengths: _Array,
+    held: _Array,
+    planted: _Array,
+    feet: _Array,
+    stiffness: float,
+    foot_resistance: float,
+    standing: float,
+    slack: float,
+    enough: float,
+    longest: float,
+    steps: int,
+    joints: _Array,
+    /,
+) -> None: ...

@@ -1,4 +1,4 @@
-"""Joints put on targets and bones given their lengths, for one clip in double precision.
+"""Joints put on targets and bones given their lengths, for one clip in double precision, without gradients.
 
 Source of the projection: ProjFlow (CVPR 2026), which has ``10 L + 1`` in every frame alone; time is ours.
 """
@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controlmm.ops.backend import Backend, core, runs_native
+from controlmm.ops.exact_checks import check_clip, check_effort, check_lengths, check_positive, joint_flags
 from controlmm.ops.exact_reference import (
     frame_bones_reference,
     project_change_reference,
@@ -53,21 +54,19 @@ def project_change(
 
     Raises:
         TypeError: If ``change`` is not float64.
-        ValueError: If shapes do not fit, or "native" was asked for and cannot run.
+        ValueError: If shapes or ``parents`` do not fit, or "native" was asked for and cannot run.
     """
-    _check_clip("change", change, held, planted, parents)
+    check_clip("change", change, held, planted, parents)
+    change = change.detach()
+    if len(change) == 0:
+        return change.clone()
     if not runs_native(backend, change):
         return project_change_reference(change, held, planted, parents)
     result = change.clone(memory_format=torch.contiguous_format)
     core().project_change(
-        torch.tensor(parents),
-        held.contiguous(),
-        planted.contiguous(),
-        STIFFNESS,
-        SMOOTHNESS,
-        STANDING,
-        result,
-    )
+        torch.tensor(parents), held.contiguous(), planted.contiguous(),
+        STIFFNESS, SMOOTHNESS, STANDING, result,
+    )  # fmt: skip
     return result
 
 
@@ -108,21 +107,26 @@ def smooth_bones(
 
     Raises:
         TypeError: If ``joints`` or ``lengths`` are not float64.
-        ValueError: If shapes do not fit, or "native" was asked for and cannot run.
+        ValueError: If shapes, ``parents`` or indices of joints do not fit, ``enough`` is not positive,
+            ``steps`` is negative, or "native" was asked for and cannot run.
     """
-    _check_clip("joints", joints, held, planted, parents)
-    _check_lengths(lengths, parents)
+    check_clip("joints", joints, held, planted, parents)
+    check_lengths(lengths, parents)
+    check_effort(enough, steps)
+    is_foot, is_toe = joint_flags("feet", feet, parents), joint_flags("toes", toes, parents)
+    joints, lengths = joints.detach(), lengths.detach()
+    if len(joints) == 0 or len(parents) == 1:
+        return joints.clone()  # no bone
     if not runs_native(backend, joints, lengths):
         return smooth_bones_reference(
-            joints, lengths, held, planted, parents, torch.tensor(feet), torch.tensor(toes),
-            enough=enough, steps=steps,
-        )  # fmt: skip
+            joints, lengths, held, planted, parents, is_foot, is_toe, enough=enough, steps=steps
+        )
     start = joints.contiguous()
     moved = start.clone()
     core().smooth_bones(
         torch.tensor(parents), start, lengths.contiguous(), held.contiguous(), planted.contiguous(),
-        _flags(feet, parents), _flags(toes, parents),
-        STIFFNESS, FOOT_RESISTANCE, STEADINESS, STANDING, BONES, DAMPING, enough, steps, moved,
+        is_foot, is_toe, STIFFNESS, FOOT_RESISTANCE, STEADINESS, STANDING, BONES, DAMPING,
+        enough, steps, moved,
     )  # fmt: skip
     return moved
 
@@ -142,10 +146,10 @@ def frame_bones(
 ) -> Float[Tensor, "T J 3"]:
     """Joints near a clip's whose bones have their lengths, each frame for itself.
 
-    Newton's method on the constraints: each step is the one that is smallest by ``10 L + 1``, 10^3 for feet and
-    10^4 for planted joints, and moves no coordinate by more than 5 cm. Frames that need more than half of the
-    steps take the others with 10^4 more for all joints: a leg nearly straight swings about while its foot is
-    heavier than its knee. Where bones cannot span what is held, lengths stay wrong.
+    Newton's method on the constraints: each step is the one that is smallest by ``10 L + 1``, 10^3 for feet
+    and 10^4 for planted joints, and moves no coordinate by more than 5 cm. Frames that need more than half of
+    the steps take the others with 10^4 more for all joints: a leg nearly straight swings about while its foot
+    is heavier than its knee. Where bones cannot span what is held, lengths stay wrong.
 
     Args:
         joints: Positions, float64.
@@ -161,49 +165,26 @@ def frame_bones(
 
     Raises:
         TypeError: If ``joints`` or ``lengths`` are not float64.
-        ValueError: If shapes do not fit, or "native" was asked for and cannot run.
+        ValueError: If shapes, ``parents`` or indices of joints do not fit, ``enough`` is not positive,
+            ``steps`` is negative or odd, ``metre`` is not positive, or "native" was asked for and cannot run.
     """
-    _check_clip("joints", joints, held, planted, parents)
-    _check_lengths(lengths, parents)
+    check_clip("joints", joints, held, planted, parents)
+    check_lengths(lengths, parents)
+    check_effort(enough, steps)
+    if steps % 2:
+        raise ValueError(f"`steps` must be even, since the second half is taken in another way, got {steps}.")
+    check_positive("metre", metre)
+    is_foot = joint_flags("feet", feet, parents)
+    joints, lengths = joints.detach(), lengths.detach()
+    if len(joints) == 0 or len(parents) == 1:
+        return joints.clone()  # no bone
     if not runs_native(backend, joints, lengths):
         return frame_bones_reference(
-            joints, lengths, held, planted, parents, torch.tensor(feet),
-            enough=enough, steps=steps, metre=metre,
-        )  # fmt: skip
+            joints, lengths, held, planted, parents, is_foot, enough=enough, steps=steps, metre=metre
+        )
     moved = joints.clone(memory_format=torch.contiguous_format)
     core().frame_bones(
         torch.tensor(parents), lengths.contiguous(), held.contiguous(), planted.contiguous(),
-        _flags(feet, parents), STIFFNESS, FOOT_RESISTANCE, STANDING, SLACK, enough, LONGEST * metre, steps, moved,
+        is_foot, STIFFNESS, FOOT_RESISTANCE, STANDING, SLACK, enough, LONGEST * metre, steps, moved,
     )  # fmt: skip
     return moved
-
-
-def _flags(joints: Sequence[int], parents: Sequence[int]) -> Bool[Tensor, "J"]:
-    flags = torch.zeros(len(parents), dtype=torch.bool)
-    flags[list(joints)] = True
-    return flags
-
-
-def _check_clip(name: str, clip: Tensor, held: Tensor, planted: Tensor, parents: Sequence[int]) -> None:
-    if clip.dtype != torch.float64:
-        raise TypeError(f"`{name}` must be float64, got {clip.dtype}.")
-    if clip.ndim != 3 or clip.shape[1:] != (len(parents), 3):
-        raise ValueError(f"`{name}` must have shape (T, {len(parents)}, 3), got {tuple(clip.shape)}.")
-    for other, flags, shape in (("held", held, clip.shape), ("planted", planted, clip.shape[:2])):
-        if flags.dtype != torch.bool or flags.shape != shape:
-            raise ValueError(
-                f"`{other}` must be boolean of shape {tuple(shape)}, got {flags.dtype} of {tuple(flags.shape)}."
-            )
-    if any(
-        (parent >= joint if joint else parent != -1) or parent < -1 for joint, parent in enumerate(parents)
-    ):
-        raise ValueError(
-            f"`parents` must be -1 for the first joint and name an earlier joint for every other, got {parents}."
-        )
-
-
-def _check_lengths(lengths: Tensor, parents: Sequence[int]) -> None:
-    if lengths.dtype != torch.float64:
-        raise TypeError(f"`lengths` must be float64, got {lengths.dtype}.")
-    if lengths.shape != (len(parents),):
-        raise ValueError(f"`lengths` must have shape ({len(parents)},), got {tuple(lengths.shape)}.")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from controlmm.ops.pose_weights import (
@@ -78,8 +78,8 @@ def smooth_bones_reference(
     held: Bool[Tensor, "T J 3"],
     planted: Bool[Tensor, "T J"],
     parents: Sequence[int],
-    feet: Int[Tensor, "F"],
-    toes: Int[Tensor, "G"],
+    is_foot: Bool[Tensor, "J"],
+    is_toe: Bool[Tensor, "J"],
     *,
     enough: float,
     steps: int,
@@ -88,10 +88,9 @@ def smooth_bones_reference(
     start, count = joints, joints.shape[1]
     resistance = torch.kron(STIFFNESS * graph_laplacian(parents) + torch.eye(count), torch.eye(3))
     extra = torch.zeros(count, 3, dtype=torch.float64)
-    extra[feet] = FOOT_RESISTANCE
+    extra[is_foot] = FOOT_RESISTANCE
     resistance = resistance + extra.flatten().diag()
-    free, is_toe = ~held.flatten(1), torch.zeros(count, 3, dtype=torch.bool)
-    is_toe[toes] = True
+    free, turns = ~held.flatten(1), is_toe.repeat_interleave(3)
     stands = STANDING * planted[:-1, :, None].expand(-1, -1, 3).double().flatten(1)  # (T-1, 3J)
     stands = stands * (free[:-1] | free[1:])
     ties, moved = STEADINESS + stands, start
@@ -100,7 +99,7 @@ def smooth_bones_reference(
         if not short.abs().max() > enough:
             break
         change = (moved - start).flatten(1)
-        step = torch.where(is_toe.flatten(), moved.flatten(1).diff(dim=0), change.diff(dim=0))
+        step = torch.where(turns, moved.flatten(1).diff(dim=0), change.diff(dim=0))
         pull = STEADINESS * change.diff(dim=0) + stands * step
         force = -(resistance @ change[..., None])[..., 0] + BONES * (slopes.mT @ short[..., None])[..., 0]
         force[:-1] += pull
@@ -121,7 +120,7 @@ def frame_bones_reference(
     held: Bool[Tensor, "T J 3"],
     planted: Bool[Tensor, "T J"],
     parents: Sequence[int],
-    feet: Int[Tensor, "F"],
+    is_foot: Bool[Tensor, "J"],
     *,
     enough: float,
     steps: int,
@@ -131,7 +130,7 @@ def frame_bones_reference(
     count, free, moved = joints.shape[1], ~held.flatten(1), joints
     resistance = torch.kron(STIFFNESS * graph_laplacian(parents) + torch.eye(count), torch.eye(3))
     stays = STANDING * planted.double()
-    stays[:, feet] += FOOT_RESISTANCE
+    stays[:, is_foot] += FOOT_RESISTANCE
     matrix = resistance + torch.diag_embed(stays[..., None].expand(-1, -1, 3).flatten(1))
     both = free[:, :, None] & free[:, None, :]
     matrix = torch.where(both, matrix, torch.diag_embed((~free).double()))
@@ -169,8 +168,10 @@ def bone_slopes(
 def solve_chain(
     blocks: Float[Tensor, "T N N"], ties: Float[Tensor, "T-1 N"], right: Float[Tensor, "T N"]
 ) -> Float[Tensor, "T N"]:
-    """``x`` of ``blocks_t x_t - ties_{t-1} x_{t-1} - ties_t x_{t+1} = right_t``: one sweep through the clip and
-    one back."""
+    """``x`` of ``blocks_t x_t - ties_{t-1} x_{t-1} - ties_t x_{t+1} = right_t``: a sweep there and one back.
+
+    The ties are already on the diagonals of the blocks.
+    """
     inverses = [torch.linalg.inv(blocks[0])]
     known = [right[0]]
     for frame in range(1, len(blocks)):

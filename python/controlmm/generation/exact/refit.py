@@ -64,5 +64,5 @@ def _turned_along(
         moved = turns[:, bones] @ old
         turned[:, bones] = new.mT @ moved @ own.mT @ columns[:, bones]
         new = moved
-    result: Tensor = turned.mT.flatten(1)
-    return result
+    fitted: Tensor = turned.mT.flatten(1)
+    return fitted

@@ -1,0 +1,77 @@
+"""What the operators on one clip in double precision require of their arguments."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from numbers import Integral
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+
+def check_clip(name: str, clip: Tensor, held: Tensor, planted: Tensor, parents: Sequence[int]) -> None:
+    """Raises ValueError or TypeError unless clip, flags and hierarchy fit."""
+    check_parents(parents)
+    _check_float64(name, clip)
+    if clip.ndim != 3 or clip.shape[1:] != (len(parents), 3):
+        raise ValueError(f"`{name}` must have shape (T, {len(parents)}, 3), got {tuple(clip.shape)}.")
+    for other, flags, shape in (("held", held, clip.shape), ("planted", planted, clip.shape[:2])):
+        if not isinstance(flags, Tensor):
+            raise TypeError(f"`{other}` must be a boolean tensor, got {type(flags).__name__}.")
+        if flags.dtype != torch.bool or flags.shape != shape:
+            came = f"{flags.dtype} of {tuple(flags.shape)}"
+            raise ValueError(f"`{other}` must be boolean of shape {tuple(shape)}, got {came}.")
+
+
+def check_parents(parents: Sequence[int]) -> None:
+    """Raises TypeError or ValueError unless each joint but the first names an earlier one."""
+    if not all(isinstance(parent, Integral) for parent in parents):
+        raise TypeError(f"`parents` must be whole numbers, got {parents}.")
+    fits = [parent == -1 if joint == 0 else 0 <= parent < joint for joint, parent in enumerate(parents)]
+    if not fits or not all(fits):
+        raise ValueError(
+            "`parents` must be -1 for the first joint and name an earlier joint for every other, "
+            f"got {parents}."
+        )
+
+
+def check_lengths(lengths: Tensor, parents: Sequence[int]) -> None:
+    """Raises TypeError or ValueError unless there is one float64 for each joint."""
+    _check_float64("lengths", lengths)
+    if lengths.shape != (len(parents),):
+        raise ValueError(f"`lengths` must have shape ({len(parents)},), got {tuple(lengths.shape)}.")
+
+
+def check_effort(enough: float, steps: int) -> None:
+    """Raises TypeError or ValueError unless the error is positive and the number of steps is one."""
+    if not isinstance(steps, Integral):
+        raise TypeError(f"`steps` must be a whole number, got {type(steps).__name__}.")
+    if steps < 0:
+        raise ValueError(f"`steps` must not be negative, got {steps}.")
+    check_positive("enough", enough)
+
+
+def check_positive(name: str, value: float) -> None:
+    """Raises ValueError unless the length is positive; NaN is not."""
+    if not value > 0:
+        raise ValueError(f"`{name}` must be a positive length, got {value}.")
+
+
+def joint_flags(name: str, joints: Sequence[int], parents: Sequence[int]) -> Bool[Tensor, "J"]:
+    """True for the joints named. Raises TypeError or ValueError for what is no joint."""
+    flags = torch.zeros(len(parents), dtype=torch.bool)
+    for joint in joints:
+        if not isinstance(joint, Integral):
+            raise TypeError(f"`{name}` must be indices of joints, got {joint!r}.")
+        if not 0 <= joint < len(parents):
+            raise ValueError(f"`{name}` must lie within [0, {len(parents)}), got {joint}.")
+        flags[int(joint)] = True
+    return flags
+
+
+def _check_float64(name: str, tensor: Tensor) -> None:
+    if not isinstance(tensor, Tensor):
+        raise TypeError(f"`{name}` must be a float64 tensor, got {type(tensor).__name__}.")
+    if tensor.dtype != torch.float64:
+        raise TypeError(f"`{name}` must be float64, got {tensor.dtype}.")
