@@ -171,6 +171,23 @@ void fuzz_gumbel() {
   controlmm::softmax_backward(rows.view, 0.5, gradient.view, 2);
 }
 
+void fuzz_exact() {
+  const std::int64_t frames = pick(0, 12), joints = pick(1, 24), steps = 2 * pick(0, 3);
+  const auto parents = row_major_block<std::int64_t>({joints});
+  for (std::int64_t j = 0; j < joints; ++j) parents.data[static_cast<std::size_t>(j)] = j == 0 ? -1 : pick(0, j - 1);
+  const auto held = row_major_block<bool>({frames, joints, 3}), planted = row_major_block<bool>({frames, joints});
+  const auto feet = row_major_block<bool>({joints}), toes = row_major_block<bool>({joints});
+  const auto lengths = row_major_block<double>({joints}), start = row_major_block<double>({frames, joints, 3});
+  const auto change = row_major_block<double>({frames, joints, 3}), clip = row_major_block<double>({frames, joints, 3});
+  const controlmm::PoseWeights weights{10, 1e3, 100, 1e4, 1e5, 3e3};
+  controlmm::project_change(parents.view, held.view, planted.view, 10, 100, 1e4, change.view);
+  controlmm::smooth_bones(parents.view, start.view, lengths.view, held.view, planted.view, feet.view, toes.view,
+                          weights, 1e-3, steps, clip.view);
+  const auto frame = row_major_block<double>({frames, joints, 3});
+  controlmm::frame_bones(parents.view, lengths.view, held.view, planted.view, feet.view, weights, 1e-9, 1e-3, 0.05,
+                         steps, frame.view);
+}
+
 }  // namespace
 
 int main() {
@@ -183,6 +200,7 @@ int main() {
       fuzz_losses<double>();
       fuzz_gumbel<float>();
       fuzz_gumbel<double>();
+      fuzz_exact();
     }
   }
 }

@@ -58,9 +58,20 @@ REFUSALS = (ValueError, TypeError, RuntimeError, NotImplementedError, IndexError
 
 
 @settings(max_examples=150, deadline=None)
-@given(a=tensors(), b=tensors(), c=tensors(), joints=st.integers(-1, 25))
-def test_public_operators_answer_or_refuse_anything(a, b, c, joints):
+@given(
+    a=tensors(),
+    b=tensors(),
+    c=tensors(),
+    joints=st.integers(-1, 25),
+    parents=st.lists(st.integers(-1, 6), max_size=7),
+    steps=st.integers(-1, 4),
+)
+def test_public_operators_answer_or_refuse_anything(a, b, c, joints, parents, steps):
+    foot = {"parents": parents, "feet": (joints,), "enough": 1e-3, "steps": steps}
     calls = [
+        lambda: ops.project_change(a, b, c, parents=parents),
+        lambda: ops.smooth_bones(a, b, a.bool(), c, toes=(0,), **foot),
+        lambda: ops.frame_bones(a, b, a.bool(), c, **foot),
         lambda: ops.recover_joints(a, joints=joints),
         lambda: ops.masked_consistency_loss(a, b, c),
         lambda: ops.obstacle_loss(a, [ops.Sphere((0, 0, 0), 1.0)], lengths=b),
@@ -99,6 +110,9 @@ ARGUMENTS = {
     "gumbel_noise": (1, lambda t: (1, 2, *t, 1)),
     "gumbel_straight_through": (5, lambda t: (*t[:2], 1.0, 3, 4, *t[2:], 1)),
     "softmax_backward": (2, lambda t: (t[0], 1.0, t[1], 1)),
+    "project_change": (4, lambda t: (*t[:3], 10.0, 100.0, 1e4, t[3])),
+    "smooth_bones": (8, lambda t: (*t[:7], 10.0, 1e3, 100.0, 1e4, 1e5, 3e3, 1e-3, 2, t[7])),
+    "frame_bones": (6, lambda t: (*t[:5], 10.0, 1e3, 1e4, 1e-9, 1e-3, 0.05, 2, t[5])),
 }
 
 
