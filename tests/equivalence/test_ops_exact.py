@@ -13,7 +13,7 @@ from controlmm.motion.skeleton import HUMANML3D, KIT
 
 pytestmark = pytest.mark.skipif(not ops.available_isas(), reason="the C++ extension is not built")
 
-TOLERANCE = 1e-9  # metres: both run in double, but factorise other matrices; they differ by about 1e-13
+TOLERANCE = 1e-9  # metres: bones differ by 2e-14, projections by 5e-11, as the twin holds softly (by 1e-12)
 SKELETONS = {"humanml3d": HUMANML3D, "kit": KIT}
 HELD = ["nothing", "one coordinate", "one axis", "a joint in all frames", "several joints", "a whole frame"]
 
@@ -124,13 +124,9 @@ def frame(case, backend):
 
 OPERATORS = {"project_change": project, "smooth_bones": smooth, "frame_bones": frame}
 CASES = [
-    *(Case(frames, held) for frames in (1, 2, 3, 8, 41) for held in HELD),
+    *(Case(frames, held) for frames in (1, 2, 3, 8, 41, 196) for held in HELD),
     *(Case(8, held, is_planted=False) for held in HELD),
-    Case(196),
-    Case(196, "one axis"),
-    Case(1, "several joints", body="kit"),
-    Case(41, "several joints", body="kit"),
-    Case(41, "nothing", is_planted=False, body="kit"),
+    *(Case(frames, held, body="kit") for frames in (1, 41) for held in HELD),
     Case(8, is_strided=True),
     Case(41, "one axis", is_strided=True, body="kit"),
 ]
