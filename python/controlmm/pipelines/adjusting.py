@@ -104,7 +104,7 @@ def _hold(features: Float[Tensor, "S T D"], held: Float[Tensor, "S H D"]) -> Non
 
 
 def _rise(held: Float[Tensor, "S H D"], decoded: Float[Tensor, "S T D"]) -> Float[Tensor, "S"]:
-    """How much higher the root is than decoded; closing has moved it by millimetres, so the middle frame's."""
+    """How much higher the root is than decoded; closing has moved it, so the middle frame's."""
     height = feature_layout(skeleton_of_width(held.shape[-1])).root_height
     rises: Tensor = (held - decoded[:, : held.shape[1]])[..., height].flatten(1).median(1).values
     return rises
