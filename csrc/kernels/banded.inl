@@ -40,13 +40,20 @@ class Banded {
     }
   }
 
+  // Four columns at a time, so that a column behind them is loaded and stored once for four.
   void factorise() {
-    const std::int64_t width = reach_ + 1;
-    for (std::int64_t j = 0; j < count_; ++j) {
-      const double* col = column(j);
-      const double inverse = 1 / col[0];
-      for (std::int64_t i = 1; i <= last(j); ++i)
-        if (col[i] != 0) subtract(column(j + i), col[i] * inverse, col + i, width - i);
+    for (std::int64_t j = 0; j < count_; j += kPanel) {
+      const std::int64_t panel = count_ - j < kPanel ? count_ - j : kPanel;
+      double inverse[kPanel];
+      for (std::int64_t p = 0; p < panel; ++p) {
+        const double* col = column(j + p);
+        inverse[p] = 1 / col[0];
+        for (std::int64_t i = 1; i < panel - p; ++i)
+          subtract(column(j + p + i), col[i] * inverse[p], col + i, reach_ + 1 - i);
+      }
+      if (panel < kPanel) return;  // nothing is behind
+      const std::int64_t end = j + kPanel + reach_ < count_ ? j + kPanel + reach_ : count_;
+      for (std::int64_t row = j + kPanel; row < end; ++row) subtract_panel(j, row, inverse);
     }
   }
 
@@ -69,6 +76,26 @@ class Banded {
   static CONTROLMM_INLINE void subtract(double* to, double factor, const double* from, std::int64_t n) {
     const Lanes<double> f = broadcast(factor);
     for (std::int64_t k = 0; k < n; k += kLanes) store(to + k, load(to + k) - f * load(from + k));
+  }
+  // What the columns from j on leave of a later one.
+  CONTROLMM_INLINE void subtract_panel(std::int64_t j, std::int64_t row, const double* inverse) const {
+    const double* from[kPanel];
+    double factor[kPanel];
+    bool any = false;
+    for (std::int64_t p = 0; p < kPanel; ++p) {
+      from[p] = column(j + p) + (row - j - p);
+      factor[p] = from[p][0] * inverse[p];
+      any = any || factor[p] != 0;
+    }
+    if (!any) return;
+    double* to = column(row);
+    const Lanes<double> a = broadcast(factor[0]), b = broadcast(factor[1]), c = broadcast(factor[2]),
+                        d = broadcast(factor[3]);
+    const std::int64_t n = reach_ + kPanel - (row - j);  // rows that the last of them reaches
+    for (std::int64_t k = 0; k < n; k += kLanes) {
+      const Lanes<double> left = load(to + k) - a * load(from[0] + k) - b * load(from[1] + k);
+      store(to + k, left - c * load(from[2] + k) - d * load(from[3] + k));
+    }
   }
   static CONTROLMM_INLINE double dot(const double* a, const double* b, std::int64_t n) {
     Lanes<double> total = zeros<double>();
