@@ -37,6 +37,7 @@ class MotionDecoder(nn.Module):
         self.tokenizer = tokenizer.eval().requires_grad_(False)
         self.normalizer = normalizer
         self._packed_version: tuple[int, ...] = ()
+        self._layers: tuple[nn.Module, list[nn.Module]] | None = None  # of the decoder, those with parameters
         self._frozen: dict[torch.dtype, FrozenDecoder] = {}
         self._spread: tuple[tuple[int, ...], CodeSpread] | None = None
         self._sensitivities: dict[int, Sensitivity] = {}  # of each channel
@@ -45,7 +46,7 @@ class MotionDecoder(nn.Module):
     def frozen(self, dtype: torch.dtype = torch.float32) -> FrozenDecoder:
         """The decoder's convolutions packed for editing; packed again when its weights have changed."""
         weights = self.tokenizer.decoder
-        version = tuple(x for p in weights.parameters() for x in (p.data_ptr(), p._version))
+        version = self._version_of(weights)
         with _FILLING:
             if self._packed_version != version:
                 self._packed_version = version
@@ -55,6 +56,13 @@ class MotionDecoder(nn.Module):
             if dtype not in self._frozen:
                 self._frozen[dtype] = FrozenDecoder(weights, dtype=dtype)
             return self._frozen[dtype]
+
+    def _version_of(self, weights: nn.Module) -> tuple[int, ...]:
+        """What changes with any weight; asked so often that a walk through the modules would show."""
+        if self._layers is None or self._layers[0] is not weights:
+            self._layers = weights, [layer for layer in weights.modules() if layer._parameters]
+        parameters = (p for layer in self._layers[1] for p in layer._parameters.values() if p is not None)
+        return tuple(x for p in parameters for x in (p.data_ptr(), p._version))
 
     def channel_gram(self, channels: tuple[int, ...], tokens: int) -> Float[Tensor, "D T D T"]:
         """Products of the rows of the decoder's Jacobian, in the unit of :meth:`spread`; see ``sensitivity``.

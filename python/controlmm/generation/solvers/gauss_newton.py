@@ -11,7 +11,6 @@ Lengths of steps are measured in standard deviations of the codes (``code_spread
 from __future__ import annotations
 
 import math
-from typing import TypeGuard
 
 import torch
 from jaxtyping import Float
@@ -50,7 +49,7 @@ def gauss_newton(
         latents: Where to start.
         keep: 1 where a token may change, 0 in padding and where it is held fixed.
         stopping: Limits; an evaluation is one pass forward, with a pass back where one is needed. A clip's
-            own Jacobian, made at its start, is not counted.
+            own Jacobian is not counted.
         progress: Called after every evaluation.
     """
     latents = latents.detach()
@@ -70,10 +69,10 @@ def gauss_newton(
             error = (3 * probe.loss) ** 0.5
             record.judge(descent.point, probe.loss, error)
             record.reason = watch.verdict(loss=probe.loss, error=error, evaluations=len(record.losses))
-            if record.reason is None and descent.asks_for_rows:
-                rows = selected.jacobian(place, probe)
-                descent.know(torch.stack([record.gradient(gradient) for gradient in rows]))
             wanted.append(descent.see(probe) if record.reason is None else None)
+            if descent.asks_for_rows:
+                rows = selected.jacobian(place, probe)
+                descent.know(torch.stack([record.gradient(gradient) for gradient in rows]), probe)
         if any(weights is not None for weights in wanted):
             gradients = selected.pull(wanted, strained=[descents[row].is_natural for row in active])
             for row, weights, gradient in zip(active, wanted, gradients, strict=True):
@@ -104,11 +103,9 @@ class _Descent:
         self._origin, self._direction, self._step = start, torch.zeros_like(start), 1.0
         self._residuals, self._iterations, self._done = residuals, iterations, -1
         self._memory = Curvature(_HISTORY)
-        self._metric: Metric | KnownRows | None = None
+        self._metric: Metric | None = None
         self._shortest: ShortestWay | None = None
-        self.asks_for_rows = 0 < coordinates <= MOST_ROWS
-        self._residual: Tensor | None = None
-        self._is_lost = False
+        self._may_know, self.asks_for_rows = 0 < coordinates <= MOST_ROWS, False
         self._way = start.new_zeros(0, 3)
         self._value, self._slope = math.inf, 0.0
         self._gradient: Tensor | None = None
@@ -125,9 +122,14 @@ class _Descent:
         return self._natural is not None
 
     @one_thread()
-    def know(self, rows: Float[Tensor, "R N"]) -> None:
-        """The clip's own Jacobian at the start."""
-        self._metric, self.asks_for_rows = KnownRows(rows), False
+    def know(self, rows: Float[Tensor, "R N"], probe: Probe) -> None:
+        """The clip's own Jacobian where the natural part has ended: the rest goes by it."""
+        known = KnownRows(rows)
+        known.bend(self._memory)
+        self._memory.clear()
+        self._may_know = self.asks_for_rows = False
+        self._shortest = ShortestWay(known, self.point, probe)
+        self._go_by(self._shortest)
 
     @one_thread()
     def see(self, probe: Probe) -> Float[Tensor, "N"] | None:
@@ -139,12 +141,10 @@ class _Descent:
             self._renew(probe)
         assert self._metric is not None
         value, weights = self._weigh(probe)
-        if self._residual is not None and self._knows(self._metric):
-            self._metric.remember(self.point - self._origin, probe.residual - self._residual)
         if not value <= self._value + _SUFFICIENT_DECREASE * self._step * self._slope:
             self._shorten(value)
             return None
-        self._done, self._residual = self._done + 1, probe.residual
+        self._done += 1
         if self._is_stale(probe):
             self._renew(probe)
             value, weights = self._weigh(probe)
@@ -154,9 +154,8 @@ class _Descent:
         elif self._natural is not None and self._natural.shift(probe.residual):
             value, weights = self._weigh(probe)
             self._gradient = None
-        if self._natural is None and self._knows(self._metric):
-            self._shortest = ShortestWay(self._metric, self.point, probe)
-            self._go_by(self._shortest)
+        if self._natural is None and self._may_know:
+            self.asks_for_rows = True
             return None
         self._value = value
         if self._natural is not None:
@@ -164,23 +163,19 @@ class _Descent:
         return weights
 
     def _follow(self, way: ShortestWay, probe: Probe) -> None:
-        """A step by known rows; where they lead nowhere, the way goes on as with many coordinates."""
+        """A step by known rows; where they lead no further, new ones if these have helped, else the average."""
         self._done += 1
         if way.see(self.point, probe):
             self._go_by(way)
         else:
-            self._shortest, self._is_lost = None, True
-            self._value, self.point = math.inf, way.best
+            self._shortest, self._value, self.point = None, math.inf, way.best
+            self._may_know = way.has_helped
 
     def _go_by(self, way: ShortestWay) -> None:
         if self._iterations is not None and self._done >= self._iterations:
             self.reason = "iterations"
         else:
             self.point = way.next()
-
-    def _knows(self, metric: Metric | KnownRows) -> TypeGuard[KnownRows]:
-        """Whether there are rows that lead somewhere."""
-        return isinstance(metric, KnownRows) and not self._is_lost
 
     def _weigh(self, probe: Probe) -> tuple[float, Float[Tensor, "N"]]:
         """What is minimised, and the weights of the residual in its gradient."""
@@ -220,17 +215,14 @@ class _Descent:
 
     def _go_straight(self) -> None:
         """From here on targets alone count."""
-        if isinstance(self._metric, KnownRows):
-            self._metric.bend(self._memory)
         self._natural, self._gradient = None, None
-        self._memory.clear()
+        if not self._may_know:  # else it says where the motion is stiff
+            self._memory.clear()
 
     def _is_stale(self, probe: Probe) -> bool:
         """Whether an average metric should be made anew: by and by, if the root has moved."""
         is_due = self._done in _EARLY_RENEWALS or (self._done and self._done % _STEPS_OF_A_METRIC == 0)
-        if not is_due or isinstance(self._metric, KnownRows):
-            return False
-        return bool((_way(probe) - self._way).abs().max() > _STALE)
+        return bool(is_due) and bool((_way(probe) - self._way).abs().max() > _STALE)
 
     def _renew(self, probe: Probe) -> None:
         """The metric of the clip as it now is; gradients of the old one cannot be compared with new ones."""

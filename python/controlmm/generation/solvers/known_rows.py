@@ -13,14 +13,14 @@ from controlmm.generation.control_residuals import Probe
 from controlmm.generation.solvers.curvature import Curvature
 
 MOST_ROWS = 18  # six joints in one frame, one joint in six: more rows cost more evaluations than they save
-# Times the mean of the diagonal of J J^T: of the metric, which coordinates that nothing moves must not
-# outweigh, and of the steps by rows.
-_DAMPING, _DAMPING_OF_STEPS = 0.03, 1e-3
-_PROGRESS, _FAILURES = 0.5, 2  # after so many steps that leave more than half, rows are not worth following
+_DAMPING = 1e-3  # times the mean of the diagonal of J J^T
+_PROGRESS, _FAILURES = 0.5, 3  # after so many steps that leave more than half, rows are not worth following
+_SHORTER = 0.25  # times the step that has led away
+_HELPED = 0.9  # of the loss at their beginning: rows that came below it are worth making anew
 
 
 class KnownRows:
-    """The metric ``M = (J J^T + damping)^-1``, as :class:`Metric`, for the Jacobian of the clip itself.
+    """The Jacobian of the clip itself, and the shortest steps by it.
 
     Args:
         rows: (N, U) gradients of the residual's coordinates in the unknowns.
@@ -29,15 +29,9 @@ class KnownRows:
     def __init__(self, rows: Float[Tensor, "N U"]) -> None:
         self._rows, self._ways = rows, rows
         self._seen: list[tuple[Tensor, Tensor]] = []
-        self._inverse = torch.cholesky_inverse(torch.linalg.cholesky(self._products(_DAMPING)))
-
-    def weigh(self, residual: Float[Tensor, "N"]) -> tuple[float, Float[Tensor, "N"]]:
-        """``r^T M r / 2`` and ``M r``."""
-        weights = self._inverse @ residual
-        return 0.5 * (residual @ weights).item(), weights
 
     def remember(self, step: Float[Tensor, "U"], change: Float[Tensor, "N"]) -> None:
-        """What a step changed of the residual, for :meth:`learn`; the metric stays as it is."""
+        """What a step changed of the residual, for :meth:`learn`."""
         self._seen.append((step, change))
 
     def learn(self) -> None:
@@ -55,15 +49,12 @@ class KnownRows:
 
     def step(self, residual: Float[Tensor, "N"]) -> Float[Tensor, "U"]:
         """The shortest step that removes the residual, up to damping."""
-        weights, _ = torch.linalg.solve_ex(self._products(_DAMPING_OF_STEPS), residual)
-        step: Tensor = -weights.float() @ self._ways
-        return step
-
-    def _products(self, damping: float) -> Float[Tensor, "N N"]:
         products = self._rows.double() @ self._ways.double().T
         diagonal = products.diagonal()
-        diagonal += damping * diagonal.mean() + torch.finfo(torch.float32).tiny
-        return products
+        diagonal += _DAMPING * diagonal.mean() + torch.finfo(torch.float32).tiny
+        weights, _ = torch.linalg.solve_ex(products, residual)
+        step: Tensor = -weights.float() @ self._ways
+        return step
 
 
 class ShortestWay:
@@ -72,6 +63,7 @@ class ShortestWay:
     def __init__(self, rows: KnownRows, point: Float[Tensor, "U"], probe: Probe) -> None:
         self.best, self._rows = point, rows
         self._residual, self._loss, self._failures = probe.residual, probe.loss, 0
+        self._first, self._share = probe.loss, 1.0
 
     def see(self, point: Float[Tensor, "U"], probe: Probe) -> bool:
         """Take the point if it is better; says whether to go on."""
@@ -79,9 +71,17 @@ class ShortestWay:
         self._failures += not probe.loss < _PROGRESS * self._loss
         if probe.loss < self._loss:
             self.best, self._residual, self._loss = point, probe.residual, probe.loss
+            self._share = 1.0
+        else:
+            self._share *= _SHORTER
         return self._failures < _FAILURES
+
+    @property
+    def has_helped(self) -> bool:
+        """Whether the way has come nearer than where it began."""
+        return self._loss < _HELPED * self._first
 
     def next(self) -> Float[Tensor, "U"]:
         """Where to go."""
         self._rows.learn()
-        return self.best + self._rows.step(self._residual)
+        return self.best + self._share * self._rows.step(self._residual)

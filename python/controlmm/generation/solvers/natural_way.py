@@ -13,11 +13,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from controlmm.generation.control_residuals import Probe
-from controlmm.generation.solvers.known_rows import MOST_ROWS
 
 _FEW = 45  # coordinates: a pose of fifteen joints, a joint at fifteen keyframes
 # Of the natural part; later ones improved little on validation clips.
-_STEPS_OF_KNOWN_ROWS, _STEPS_OF_FEW, _STEPS = 3, 5, 15
+_STEPS_OF_FEW, _STEPS = 5, 15
 _BALANCED = 0.1  # squared gradient below this share of what the residual would push with when alone
 
 
@@ -27,8 +26,6 @@ def natural_steps(coordinates: int, iterations: int | None) -> int:
     A few targets hardly fight with the feet.
     """
     steps = _STEPS if coordinates > _FEW else _STEPS_OF_FEW
-    if coordinates <= MOST_ROWS:
-        steps = _STEPS_OF_KNOWN_ROWS
     return steps if iterations is None else min(steps, iterations // 2)
 
 
