@@ -9,8 +9,9 @@ same tokens. Errors, seconds and evaluations are medians over clips; seconds are
 editing of one clip alone, so that a busy machine does not count. FID, R-precision and the distance to the
 text are those of the in-project evaluator. ``paper-accurate`` takes 1,600 evaluations and logits editing of
 its own, whose time counts, so it runs on ``--slow-limit`` clips and comes last; scores that need 32 clips
-are then a dash. ``latents alone`` is preset ``accurate`` without its closed end, to 1 mm. "Worth" are the
-seconds in plain evaluations of the same clip: value and gradient of the controlled channels.
+are then a dash. ``gauss-newton`` is preset ``accurate``, ``latents alone`` the same to 1 mm without
+a closed end. "Worth" are the seconds in plain evaluations of the same clip: value and gradient of the
+controlled channels.
 
 A killed run goes on where it was, and the tables are written after every row. Two processes with different
 ``--controls`` may share ``--out``. With 32 clips and 4 slow ones, a choice of joints and keyframes takes

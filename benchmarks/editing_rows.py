@@ -31,6 +31,7 @@ PLANS: dict[str, Preset] = {
     "unedited": UNEDITED,
     "latents alone": replace(PRESETS["accurate"], closes_from=None),
     "gauss-newton": PRESETS["accurate"],
+    "fast": PRESETS["fast"],
     "exact": PRESETS["exact"],
     "lbfgs": replace(PRESETS["accurate"], budget=replace(PRESETS["accurate"].budget, solver="lbfgs")),
     "paper-fast": PRESETS["paper-fast"],

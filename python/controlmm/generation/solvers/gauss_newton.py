@@ -163,7 +163,7 @@ class _Descent:
         return weights
 
     def _follow(self, way: ShortestWay, probe: Probe) -> None:
-        """A step by known rows; where they lead no further, new ones if these have helped, else the average."""
+        """A step by known rows. Where they lead no further: new ones if they helped, else the average."""
         self._done += 1
         if way.see(self.point, probe):
             self._go_by(way)
