@@ -19,6 +19,7 @@ from controlmm.motion.ground import grounded
 from controlmm.motion.motion import Motion
 from controlmm.ops import recover_joints
 from controlmm.pipelines.checks import MIN_FRAMES, check_sampling, frame_count
+from controlmm.pipelines.closing import close_clips
 from controlmm.pipelines.output import GenerationResult
 from controlmm.pipelines.source_motion import SourceMotion
 from controlmm.text import check_prompt
@@ -65,6 +66,8 @@ def run_chain(
             progress=progress,
         )
         features = pipeline.decoder.clip_features(latents)[:, :frames]
+        if pipeline.closes(preset, has_terms=False):
+            close_clips(features, targets, mask, [frames] * samples, pipeline.skeleton)
         if not tails:
             features = grounded(features)
         joints = recover_joints(features, joints=pipeline.skeleton.num_joints)

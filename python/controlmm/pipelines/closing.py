@@ -17,6 +17,8 @@ def close_clips(
     mask: Bool[Tensor, "B T J 3"],
     lengths: Sequence[int],
     skeleton: Skeleton,
+    *,
+    bones: Float[Tensor, "J"] | None = None,
 ) -> tuple[ExactReport, ...]:
     """Let clips meet their targets exactly, with whole bones; writes into ``features``.
 
@@ -26,10 +28,11 @@ def close_clips(
         mask: The controlled coordinates; may be empty, bones are restored all the same.
         lengths: Frames of each clip.
         skeleton: Whose bones.
+        bones: Other lengths of the bones, of a body that is there already.
     """
     clips = [(features[row, :end], targets[row, :end], mask[row, :end]) for row, end in enumerate(lengths)]
     reports = []
-    for row, (met, report) in enumerate(all_meet_exactly(clips, skeleton)):
+    for row, (met, report) in enumerate(all_meet_exactly(clips, skeleton, bones=bones)):
         features[row, : lengths[row]] = met
         reports.append(report)
     return tuple(reports)

@@ -226,9 +226,9 @@ class ControlMM(MotionPipeline[Preset]):
         """See :class:`MotionPipeline`."""
         return plan.is_exact
 
-    def inexact(self, preset: str | Preset, guidance_scale: float | None) -> Preset:
-        """See :class:`MotionPipeline`; latents do all, timelines, chains and edits have no closed end."""
-        return replace(super().inexact(preset, guidance_scale), closes_from=None)
+    def open_ended(self, plan: Preset) -> Preset:
+        """See :class:`MotionPipeline`."""
+        return replace(plan, closes_from=None)
 
     def limited(
         self,

@@ -22,14 +22,17 @@ from controlmm.generation.shares import in_shares
 from controlmm.generation.solvers import Progress
 from controlmm.generation.terms import JointTerm
 from controlmm.generation.variation import VARIATION_STEPS, vary_tokens
+from controlmm.motion.features import bone_lengths
 from controlmm.motion.motion import Motion
 from controlmm.ops import recover_joints
 from controlmm.pipelines.checks import check_sampling
 from controlmm.pipelines.clip_batch import share_count
+from controlmm.pipelines.closing import close_clips
 from controlmm.pipelines.edit_scene import EditScene, held_term
 from controlmm.pipelines.output import GenerationResult
 from controlmm.pipelines.pipeline import MAX_FRAMES
 from controlmm.pipelines.presets import Preset
+from controlmm.pipelines.reach import check_reach
 from controlmm.pipelines.source_motion import Interval
 from controlmm.pipelines.token_drawing import drawn_latents
 
@@ -101,7 +104,21 @@ def run_edit(
         progress=progress,
     )
     features = pipeline.decoder.clip_features(latents)[:, :frames]
+    if pipeline.closes(preset, has_terms=bool(scene.terms(samples, padded))):
+        _close(pipeline, scene, features, exact=exact)
     return edit_result(scene, features, latents, started)
+
+
+def _close(pipeline: ControlMM, scene: EditScene, features: Float[Tensor, "B T D"], *, exact: bool) -> None:
+    """Joints on controls and, with ``exact``, on what is kept; bones as long as those of the source."""
+    source, shown, skeleton = scene.source, scene.shown, pipeline.skeleton
+    reached = check_reach(scene.controls, skeleton, is_strict=False)
+    is_kept = scene.kept[..., None] & (exact | ~scene.whole)[:, None, None]
+    targets = torch.where(shown.mask & ~is_kept, shown.targets, source.joints)
+    mask = (shown.mask & reached[:, None, None]) | is_kept
+    targets, mask = (x.expand(len(features), -1, -1, -1) for x in (targets, mask))
+    bones = bone_lengths(source.joints.double(), skeleton).mean(0)
+    close_clips(features, targets, mask, [source.num_frames] * len(features), skeleton, bones=bones)
 
 
 def _edited(
@@ -122,7 +139,8 @@ def _edited(
         return latents
     may_change = (request.valid if exact else request.drawn)[..., None].float()
     progress = request.progress
-    return edit_latents(objective, latents, may_change, preset.budget, progress=progress).latents
+    budget = preset.latent_budget(has_terms=bool(terms))
+    return edit_latents(objective, latents, may_change, budget, progress=progress).latents
 
 
 def _tokens(pipeline: ControlMM, scene: EditScene, padded: int) -> Int[Tensor, "1 L Q"]:

@@ -190,8 +190,12 @@ class MotionPipeline(PretrainedPipeline, ABC, Generic[_Plan]):
         """Whether targets that bones cannot span are refused."""
         return False
 
+    def open_ended(self, plan: _Plan) -> _Plan:
+        """The plan where latents do all: joints must not be put on what editing moves them towards."""
+        return plan
+
     def inexact(self, preset: str | _Plan, guidance_scale: float | None) -> _Plan:
-        """The preset for a call whose joints cannot be put on their targets afterwards.
+        """The preset for a call that cannot say beforehand what is out of reach.
 
         Raises:
             TypeError: If it is none.

@@ -76,6 +76,7 @@ def run_timeline(
         )
     else:
         hold_rest = method == "passes"
+        preset = pipeline.open_ended(preset)  # what earlier passes decided may not fit the later body
         result = _run_passes(
             pipeline,
             scene,

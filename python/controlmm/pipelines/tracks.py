@@ -20,7 +20,9 @@ from controlmm.motion.ground import grounded
 from controlmm.motion.motion import Motion
 from controlmm.ops import recover_joints
 from controlmm.pipelines.checks import MIN_FRAMES
+from controlmm.pipelines.closing import close_clips
 from controlmm.pipelines.output import GenerationResult
+from controlmm.pipelines.reach import check_reach
 from controlmm.pipelines.scene import Scene
 from controlmm.pipelines.source_motion import SourceMotion
 
@@ -69,6 +71,11 @@ def run_tracks(
         progress=progress,
     )
     decoded = pipeline.decoder.clip_features(latents)[:, :frames]
+    if pipeline.closes(preset, has_terms=bool(scene.obstacles)):
+        reached = check_reach(scene.controls, skeleton, is_strict=False)
+        within = scene.canonical.mask & reached[:, None, None]
+        targets, mask = (x.expand(samples, -1, -1, -1) for x in (scene.canonical.targets, within))
+        close_clips(decoded, targets, mask, [frames] * samples, skeleton)
     held = term.errors(recover_joints(decoded, joints=skeleton.num_joints))
     result = scene.result(decoded, latents, seconds_taken=time.perf_counter() - started)
     return dataclasses.replace(result, control_error=torch.maximum(result.control_error, held))
@@ -112,6 +119,9 @@ def _motions(
         tokens = pipeline.padded_frames(length) // pipeline.decoder.downsample
         clips = latents[index * samples : (index + 1) * samples, :tokens]
         own = pipeline.decoder.clip_features(clips)[:, :length]
+        if pipeline.closes(preset, has_terms=False):  # parts of bodies with whole bones fit together
+            wanted, shown = (x[index, :length].expand(samples, -1, -1, -1) for x in (targets, mask))
+            close_clips(own, wanted, shown, [length] * samples, pipeline.skeleton)
         features.append(own if mask[index, ..., 1].any() else grounded(own))
     return features, [start for start, _ in spans]
 

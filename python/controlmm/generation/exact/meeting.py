@@ -49,6 +49,8 @@ def meet_exactly(
     targets: Float[Tensor, "T J 3"],
     mask: Bool[Tensor, "T J 3"],
     skeleton: Skeleton,
+    *,
+    bones: Float[Tensor, "J"] | None = None,
 ) -> tuple[Float[Tensor, "T D"], ExactReport]:
     """Features whose joints lie on the targets, changed least.
 
@@ -58,10 +60,11 @@ def meet_exactly(
         mask: The controlled coordinates.
         skeleton: Its bone lengths are kept, where they are published; else those that the clip has on
             average.
+        bones: Lengths to keep instead, of the bone from each joint to its parent.
     """
     joints = recover_joints(features[None].double(), joints=skeleton.num_joints)[0]
     targets = targets.double()
-    lengths = _lengths(joints, skeleton)
+    lengths = _lengths(joints, skeleton) if bones is None else bones.double()
     if _residual(joints, targets, mask) <= _NOTHING and _bone_error(joints, lengths, skeleton) <= _NOTHING:
         return features, _report((joints, joints), targets, mask, features, lengths, skeleton)
     held = mask.clone()
@@ -78,11 +81,13 @@ def meet_exactly(
 def all_meet_exactly(
     clips: Sequence[tuple[Float[Tensor, "T D"], Float[Tensor, "T J 3"], Bool[Tensor, "T J 3"]]],
     skeleton: Skeleton,
+    *,
+    bones: Float[Tensor, "J"] | None = None,
 ) -> list[tuple[Float[Tensor, "T D"], ExactReport]]:
     """:func:`meet_exactly` for (features, targets, mask) of several clips, side by side."""
 
     def meet(clip: int, _: Progress | None) -> tuple[Float[Tensor, "T D"], ExactReport]:
-        return meet_exactly(*clips[clip], skeleton)
+        return meet_exactly(*clips[clip], skeleton, bones=bones)
 
     return side_by_side([partial(meet, clip) for clip in range(len(clips))])
 
