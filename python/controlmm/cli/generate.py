@@ -68,8 +68,9 @@ def generate(
     preset: Annotated[
         str,
         typer.Option(
-            help="fast, balanced or accurate: within 1 cm, 3 mm, 1 mm. exact: on the targets, bones whole. "
-            "paper-fast, paper-medium, paper-accurate: the papers' steps."
+            help="fast, balanced, accurate, exact: all put joints on their targets, with whole bones; later ones "
+            "bend motions less for it, and exact refuses what no body can do. paper-fast, paper-medium, "
+            "paper-accurate: the papers' steps."
         ),
     ] = "balanced",
     naturalness: Annotated[
