@@ -68,7 +68,7 @@ def generate(
     preset: Annotated[
         str,
         typer.Option(
-            help="fast, balanced, accurate, exact: all put joints on their targets, with whole bones; later ones "
+            help="fast, balanced, accurate, exact: all put joints on targets, with whole bones; later ones "
             "bend motions less for it, and exact refuses what no body can do. paper-fast, paper-medium, "
             "paper-accurate: the papers' steps."
         ),
