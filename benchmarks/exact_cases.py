@@ -1,4 +1,4 @@
-"""The workloads of the exact mode: one clip, kernels against their plain-torch twins, in double precision."""
+"""The workloads of the closed end: one clip, kernels against their plain-torch twins, in double precision."""
 
 from __future__ import annotations
 

@@ -115,7 +115,7 @@ struct BodyTree {
   const std::int64_t* parents;
 };
 
-// Of the exact mode: one clip in double precision, row-major [frames, joints, 3] or [frames, joints].
+// Of the closed end: one clip in double precision, row-major [frames, joints, 3] or [frames, joints].
 struct ProjectionArgs {
   BodyTree body;
   const std::uint8_t *held, *planted;

@@ -1,4 +1,4 @@
-// The kernels of the exact mode through the C++ interface: worked by hand, held coordinates, refusals.
+// The kernels of the closed end through the C++ interface: worked by hand, held coordinates, refusals.
 #include <limits>
 #include <vector>
 

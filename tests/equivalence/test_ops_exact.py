@@ -1,4 +1,4 @@
-"""The kernels of the exact mode: against their twins, the same bits everywhere, held coordinates kept."""
+"""The kernels of the closed end: against their twins, the same bits everywhere, held coordinates kept."""
 
 import contextlib
 import functools

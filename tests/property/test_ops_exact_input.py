@@ -1,4 +1,4 @@
-"""What the operators of the exact mode refuse, in either backend, and that they say what was wrong."""
+"""What the operators of the closed end refuse, in either backend, and that they say what was wrong."""
 
 import pytest
 import torch

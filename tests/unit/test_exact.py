@@ -1,4 +1,4 @@
-"""The exact mode as a whole: features of moved joints, targets met with whole bones; targets out of reach."""
+"""The closed end as a whole: features of moved joints, targets met with whole bones; targets out of reach."""
 
 from __future__ import annotations
 

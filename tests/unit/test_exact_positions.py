@@ -1,4 +1,4 @@
-"""Joints of the exact mode: the projection against a dense system, bone lengths, planted feet."""
+"""Joints of the closed end: the projection against a dense system, bone lengths, planted feet."""
 
 import pytest
 import torch

@@ -134,7 +134,7 @@ void gumbel_straight_through(const TensorView& logits, const TensorView& codeboo
 /// @param gradient      Row-major [rows, codes]: on entry the gradient of the probabilities, on return of the logits.
 void softmax_backward(const TensorView& probabilities, double temperature, const TensorView& gradient, int threads = 1);
 
-/// The kernels of the exact mode work on one clip in double precision, in one thread. `parents`: int64 [joints], -1
+/// The kernels of the closed end work on one clip in double precision, in one thread. `parents`: int64 [joints], -1
 /// for the root, which comes first, and parents before their children.
 
 /// What joints resist with and bones pull with; see the Python functions of the same names.

@@ -23,9 +23,9 @@ class GenerationResult:
         control_error: (S,) mean distance of the controlled joints to their targets, metres, measured on the
             motions as returned; 0 without controls.
         penetration: (S,) greatest depth to which a joint enters an obstacle in metres, measured likewise.
-        latents: (S, L, C) code-space latents that decode to the motions, before they were stood on the floor.
+        latents: (S, L, C) latents that decode to the motions, but for their closed end and the floor.
         seconds_taken: Wall-clock seconds of the call.
-        exact: What the exact mode did to each sample; empty without it.
+        exact: What the closed end did to each sample; empty without it.
     """
 
     motions: tuple[Motion, ...]

@@ -126,11 +126,12 @@ class MotionPipeline(PretrainedPipeline, ABC, Generic[_Plan]):
                 one in :class:`Avoid` to choose joints and margin.
             objectives: Differentiable functions of the joints to be made small.
             samples: How many motions; sample ``i`` is the same however many are asked for.
-            preset: ``fast``, ``balanced``, ``accurate``, one of the papers' (``paper-accurate``), or a preset
-                of one's own.
+            preset: ``fast``, ``balanced``, ``accurate``, ``exact``, a paper's (``paper-accurate``), or
+                a preset of one's own. Ours put joints on their targets and give bones their lengths, unless
+                there are obstacles or objectives.
             guidance_scale: How strongly the text counts; ``None`` takes the preset's, or the model's.
-            tolerance: Control error at which editing is done, in metres or as ``"1mm"``; ``None`` takes the
-                preset's.
+            tolerance: Control error at which the editing of latents is done, in metres or as ``"1mm"``;
+                ``None`` takes the preset's.
             time_budget: Time for the editing of latents, in seconds or as ``"200ms"``. Results then depend on
                 the speed of the machine.
             naturalness: How strongly editing keeps what no target leads as it was: 0 not at all, 1 as the

@@ -1,4 +1,4 @@
-"""The exact mode: joints put on their targets in closed form, the body kept whole."""
+"""The closed end: joints put on their targets, bones given their lengths, without any network."""
 
 from controlmm.generation.exact.meeting import ExactReport, all_meet_exactly, meet_exactly
 

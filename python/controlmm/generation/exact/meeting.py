@@ -1,4 +1,4 @@
-"""The exact mode as a whole: project, restore the bones, refit the features, say what it cost."""
+"""The closed end as a whole: project, restore the bones, refit the features, say what it cost."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _NOTHING = 1e-4  # of the skeleton's unit: a motion so near its targets, with su
 
 @dataclass(frozen=True)
 class ExactReport:
-    """What the exact mode did to one clip. Pairs are before and after.
+    """What the closed end did to one clip. Pairs are before and after.
 
     Attributes:
         residual: Largest distance of a controlled coordinate to its target, metres.
