@@ -203,9 +203,7 @@ static constexpr std::int64_t guidance_scratch(const MotionShape& shape, std::in
 constexpr std::int64_t kPanel = 4;
 
 /// Doubles of a column of a banded matrix: whole blocks from any of its entries on, or a panel's width further.
-static constexpr std::int64_t banded_stride(std::int64_t reach) {
-  return round_up_to_lanes(reach + kPanel + kLanes);
-}
+static constexpr std::int64_t banded_stride(std::int64_t reach) { return round_up_to_lanes(reach + kPanel + kLanes); }
 
 /// Doubles of scratch memory for a banded matrix.
 static constexpr std::int64_t banded_scratch(std::int64_t unknowns, std::int64_t reach) {
