@@ -25,7 +25,7 @@ def test_a_published_model_has_the_published_scales(tiny_pipeline):
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_every_preset_takes_what_suits_the_model(tiny_pipeline, preset):
-    """But for thorough ones, which guide in all steps, as the papers do and as a scale of the caller's own does."""
+    """But for thorough ones, which guide in all steps, as a scale of the caller's own does."""
     tiny_pipeline.guidance = Guidance(1.5, 2.5, share=0.25)
     plan = tiny_pipeline.resolve_preset(preset, None)
     assert (plan.guidance_scale, plan.residual_guidance_scale) == (1.5, 2.5)
