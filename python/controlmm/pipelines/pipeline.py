@@ -205,8 +205,8 @@ class MotionPipeline(PretrainedPipeline, ABC, Generic[_Plan]):
         plan = self.resolve_preset(preset, guidance_scale)
         if self.is_exact(plan):
             raise ValueError(
-                "`preset` 'exact' makes single motions from controls; `timeline`, `chain` and `edit` cannot. "
-                "Use 'accurate'."
+                "`preset` 'exact' makes single motions from controls. Use 'accurate' for `timeline`, `chain` "
+                "and `edit`: it meets what bones can span as exactly."
             )
         return plan
 

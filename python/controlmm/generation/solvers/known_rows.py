@@ -28,20 +28,13 @@ class KnownRows:
 
     def __init__(self, rows: Float[Tensor, "N U"]) -> None:
         self._rows, self._ways = rows, rows
-        self._seen: list[tuple[Tensor, Tensor]] = []
 
-    def remember(self, step: Float[Tensor, "U"], change: Float[Tensor, "N"]) -> None:
-        """What a step changed of the residual, for :meth:`learn`."""
-        self._seen.append((step, change))
-
-    def learn(self) -> None:
-        """Correct the rows by what was seen (Broyden's update: Nocedal and Wright, chapter 11.1)."""
-        for step, change in self._seen:
-            length = (step @ step).item()
-            if length > 0:
-                surprise = change.float() - self._rows @ step
-                self._rows = self._rows.addr(surprise / length, step)
-        self._seen.clear()
+    def learn(self, step: Float[Tensor, "U"], change: Float[Tensor, "N"]) -> None:
+        """Correct the rows by what a step changed (Broyden's update: Nocedal and Wright, chapter 11.1)."""
+        length = (step @ step).item()
+        if length > 0:
+            surprise = change.float() - self._rows @ step
+            self._rows = self._rows.addr(surprise / length, step)
 
     def bend(self, memory: Curvature) -> None:
         """From here on steps avoid directions that are stiff by ``memory``, that of the natural part."""
@@ -67,7 +60,7 @@ class ShortestWay:
 
     def see(self, point: Float[Tensor, "U"], probe: Probe) -> bool:
         """Take the point if it is better; says whether to go on."""
-        self._rows.remember(point - self.best, probe.residual - self._residual)
+        self._rows.learn(point - self.best, probe.residual - self._residual)
         self._failures += not probe.loss < _PROGRESS * self._loss
         if probe.loss < self._loss:
             self.best, self._residual, self._loss = point, probe.residual, probe.loss
@@ -83,5 +76,4 @@ class ShortestWay:
 
     def next(self) -> Float[Tensor, "U"]:
         """Where to go."""
-        self._rows.learn()
         return self.best + self._share * self._rows.step(self._residual)
