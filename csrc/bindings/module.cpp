@@ -123,10 +123,11 @@ void register_kernels(Module& m) {
   m.def(
       "smooth_bones",
       [](Arg parents, Arg start, Arg lengths, Arg held, Arg planted, Arg feet, Arg toes, double stiffness,
-         double foot_resistance, double steadiness, double standing, double bone_weight, double damping, double enough,
-         std::int64_t steps, Arg joints) {
+         double foot_resistance, double steadiness, double standing, double bone_weight, double damping,
+         double later_damping, double enough, std::int64_t steps, Arg joints) {
         smooth_bones(parents.view(), start.view(), lengths.view(), held.view(), planted.view(), feet.view(),
-                     toes.view(), {stiffness, foot_resistance, steadiness, standing, bone_weight, damping}, enough,
+                     toes.view(),
+                     {stiffness, foot_resistance, steadiness, standing, bone_weight, damping, later_damping}, enough,
                      steps, joints.view());
       },
       Unlocked());
@@ -135,7 +136,7 @@ void register_kernels(Module& m) {
       [](Arg parents, Arg lengths, Arg held, Arg planted, Arg feet, double stiffness, double foot_resistance,
          double standing, double slack, double enough, double longest, std::int64_t steps, Arg joints) {
         frame_bones(parents.view(), lengths.view(), held.view(), planted.view(), feet.view(),
-                    {stiffness, foot_resistance, 0, standing, 0, 0}, slack, enough, longest, steps, joints.view());
+                    {stiffness, foot_resistance, 0, standing, 0, 0, 0}, slack, enough, longest, steps, joints.view());
       },
       Unlocked());
 }

@@ -26,17 +26,17 @@ class Banded {
 
   /// Fixes the unknowns whose flag is set at what `right` has for them; flag of unknown i: `is_held[i * flag_stride]`.
   void hold(const std::uint8_t* is_held, std::int64_t flag_stride, double* right) {
+    const auto fix = [&](double& entry, std::int64_t held, std::int64_t other) {
+      if (entry == 0) return;  // most are: this spares the flags
+      if (!is_held[other * flag_stride]) right[other] -= entry * right[held];
+      entry = 0;
+    };
     for (std::int64_t j = 0; j < count_; ++j) {
-      double* col = column(j);
-      const bool held = is_held[j * flag_stride] != 0;
-      for (std::int64_t i = 1; i <= last(j); ++i) {
-        if (col[i] == 0) continue;
-        const bool other = is_held[(j + i) * flag_stride] != 0;
-        if (held && !other) right[j + i] -= col[i] * right[j];
-        if (other && !held) right[j] -= col[i] * right[j + i];
-        if (held || other) col[i] = 0;
-      }
-      if (held) col[0] = 1;
+      if (!is_held[j * flag_stride]) continue;
+      const std::int64_t first = j < reach_ ? 0 : j - reach_;
+      for (std::int64_t i = first; i < j; ++i) fix(column(i)[j - i], j, i);
+      for (std::int64_t i = 1; i <= last(j); ++i) fix(column(j)[i], j, j + i);
+      column(j)[0] = 1;
     }
   }
 

@@ -127,7 +127,7 @@ struct SmoothBonesArgs {
   BodyTree body;
   const double *start, *lengths;
   const std::uint8_t *held, *planted, *feet, *toes;
-  double stiffness, foot_resistance, steadiness, standing, bone_weight, damping, enough;
+  double stiffness, foot_resistance, steadiness, standing, bone_weight, damping, later_damping, enough;
   std::int64_t steps;
   double* joints;  // the start's, then moved
 };

@@ -28,7 +28,7 @@ inline double worst_bone(const BodyTree& body, const double* joints, const doubl
 }
 
 // Resistance of the joints against change within a frame, and what bones pull with.
-inline void add_frame(const SmoothBonesArgs& args, std::int64_t t, Banded& system, double* force) {
+inline void add_frame(const SmoothBonesArgs& args, std::int64_t t, double damping, Banded& system, double* force) {
   const BodyTree& body = args.body;
   const std::int64_t first = 3 * t * body.joints;
   const double* joints = args.joints + first;
@@ -38,7 +38,7 @@ inline void add_frame(const SmoothBonesArgs& args, std::int64_t t, Banded& syste
     for (int c = 0; c < 3; ++c) {
       const std::int64_t k = 3 * j + c;
       const double own = 1 + (args.feet[j] ? args.foot_resistance : 0), change = joints[k] - start[k];
-      system.add(first + k, first + k, own + args.damping);
+      system.add(first + k, first + k, own + damping);
       force[first + k] -= own * change;
       if (parent < 0) continue;
       const std::int64_t up = 3 * parent + c;
@@ -90,8 +90,9 @@ inline void smooth_bones(const SmoothBonesArgs& args, double* memory) {
   for (std::int64_t n = 0; n < args.steps; ++n) {
     if (!(worst_bone(body, args.joints, args.lengths, body.frames) > args.enough)) return;
     if (n > 0) system.clear();
+    const double damping = n == 0 ? args.damping : args.later_damping;
     for (std::int64_t i = 0; i < count + banded_stride(reach); ++i) step[i] = 0;
-    for (std::int64_t t = 0; t < body.frames; ++t) add_frame(args, t, system, step);
+    for (std::int64_t t = 0; t < body.frames; ++t) add_frame(args, t, damping, system, step);
     for (std::int64_t t = 0; t + 1 < body.frames; ++t) add_ties(args, t, system, step);
     for (std::int64_t i = 0; i < count; ++i)
       if (args.held[i]) step[i] = 0;

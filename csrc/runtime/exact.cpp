@@ -78,6 +78,7 @@ void smooth_bones(const TensorView& parents, const TensorView& start, const Tens
                              weights.standing,
                              weights.bone_weight,
                              weights.damping,
+                             weights.later_damping,
                              enough,
                              steps,
                              joints.as<double>()};

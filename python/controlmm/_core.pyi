@@ -131,6 +131,7 @@ def smooth_bones(
     standing: float,
     bone_weight: float,
     damping: float,
+    later_damping: float,
     enough: float,
     steps: int,
     joints: _Array,

@@ -11,7 +11,7 @@ namespace {
 using controlmm::row_major;
 constexpr std::int64_t kFrames = 6, kJoints = 4;
 constexpr std::size_t kWidth = 3 * kJoints;
-constexpr controlmm::PoseWeights kWeights{10, 1e3, 100, 1e4, 1e5, 3e3};
+constexpr controlmm::PoseWeights kWeights{10, 1e3, 100, 1e4, 1e5, 3e3, 1e3};
 
 // A trunk with two limbs that sways, all bones a tenth too long.
 struct Clip {

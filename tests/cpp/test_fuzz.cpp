@@ -179,7 +179,7 @@ void fuzz_exact() {
   const auto feet = row_major_block<bool>({joints}), toes = row_major_block<bool>({joints});
   const auto lengths = row_major_block<double>({joints}), start = row_major_block<double>({frames, joints, 3});
   const auto change = row_major_block<double>({frames, joints, 3}), clip = row_major_block<double>({frames, joints, 3});
-  const controlmm::PoseWeights weights{10, 1e3, 100, 1e4, 1e5, 3e3};
+  const controlmm::PoseWeights weights{10, 1e3, 100, 1e4, 1e5, 3e3, 1e3};
   controlmm::project_change(parents.view, held.view, planted.view, 10, 100, 1e4, change.view);
   controlmm::smooth_bones(parents.view, start.view, lengths.view, held.view, planted.view, feet.view, toes.view,
                           weights, 1e-3, steps, clip.view);

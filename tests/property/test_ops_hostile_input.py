@@ -111,7 +111,7 @@ ARGUMENTS = {
     "gumbel_straight_through": (5, lambda t: (*t[:2], 1.0, 3, 4, *t[2:], 1)),
     "softmax_backward": (2, lambda t: (t[0], 1.0, t[1], 1)),
     "project_change": (4, lambda t: (*t[:3], 10.0, 100.0, 1e4, t[3])),
-    "smooth_bones": (8, lambda t: (*t[:7], 10.0, 1e3, 100.0, 1e4, 1e5, 3e3, 1e-3, 2, t[7])),
+    "smooth_bones": (8, lambda t: (*t[:7], 10.0, 1e3, 100.0, 1e4, 1e5, 3e3, 1e3, 1e-3, 2, t[7])),
     "frame_bones": (6, lambda t: (*t[:5], 10.0, 1e3, 1e4, 1e-9, 1e-3, 0.05, 2, t[5])),
 }
 

@@ -139,7 +139,7 @@ void softmax_backward(const TensorView& probabilities, double temperature, const
 
 /// What joints resist with and bones pull with; see the Python functions of the same names.
 struct PoseWeights {
-  double stiffness, foot_resistance, steadiness, standing, bone_weight, damping;
+  double stiffness, foot_resistance, steadiness, standing, bone_weight, damping, later_damping;
 };
 
 /// The smallest smooth change of a clip that moves the held coordinates by what they lack; see `project_change`.

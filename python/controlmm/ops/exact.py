@@ -22,6 +22,7 @@ from controlmm.ops.pose_weights import (
     BONES,
     DAMPING,
     FOOT_RESISTANCE,
+    LATER_DAMPING,
     LONGEST,
     SLACK,
     SMOOTHNESS,
@@ -125,7 +126,7 @@ def smooth_bones(
     moved = start.clone()
     core().smooth_bones(
         torch.tensor(parents), start, lengths.contiguous(), held.contiguous(), planted.contiguous(),
-        is_foot, is_toe, STIFFNESS, FOOT_RESISTANCE, STEADINESS, STANDING, BONES, DAMPING,
+        is_foot, is_toe, STIFFNESS, FOOT_RESISTANCE, STEADINESS, STANDING, BONES, DAMPING, LATER_DAMPING,
         enough, steps, moved,
     )  # fmt: skip
     return moved

@@ -12,6 +12,7 @@ from controlmm.ops.pose_weights import (
     BONES,
     DAMPING,
     FOOT_RESISTANCE,
+    LATER_DAMPING,
     LONGEST,
     SLACK,
     SMOOTHNESS,
@@ -94,7 +95,7 @@ def smooth_bones_reference(
     stands = STANDING * planted[:-1, :, None].expand(-1, -1, 3).double().flatten(1)  # (T-1, 3J)
     stands = stands * (free[:-1] | free[1:])
     ties, moved = STEADINESS + stands, start
-    for _ in range(steps):
+    for number in range(steps):
         slopes, short = bone_slopes(moved, lengths, parents)
         if not short.abs().max() > enough:
             break
@@ -104,7 +105,8 @@ def smooth_bones_reference(
         force = -(resistance @ change[..., None])[..., 0] + BONES * (slopes.mT @ short[..., None])[..., 0]
         force[:-1] += pull
         force[1:] -= pull
-        blocks = resistance + BONES * slopes.mT @ slopes + DAMPING * torch.eye(3 * count)
+        blocks = resistance + BONES * slopes.mT @ slopes
+        blocks = blocks + (LATER_DAMPING if number else DAMPING) * torch.eye(3 * count)
         blocks[:-1].diagonal(dim1=1, dim2=2).add_(ties)
         blocks[1:].diagonal(dim1=1, dim2=2).add_(ties)
         both = free[:, :, None] & free[:, None, :]

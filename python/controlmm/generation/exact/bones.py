@@ -8,7 +8,7 @@ from torch import Tensor
 from controlmm.motion.skeleton import Skeleton
 from controlmm.ops import frame_bones, smooth_bones
 
-_STEPS, _SMOOTH_ENOUGH = 4, 1e-3  # of the whole clip; metres of the worst bone
+_STEPS, _SMOOTH_ENOUGH = 3, 1e-3  # of the whole clip; metres of the worst bone
 _FRAME_STEPS, _ENOUGH = 40, 1e-5  # of each frame
 
 
