@@ -209,6 +209,22 @@ def test_groups_are_orthonormal_and_join_neighbours_of_one_coordinate():
     assert all(len(set(joint[row > 0].tolist())) == 1 for row in sums)
 
 
+def test_many_coordinates_of_the_root_are_grouped_by_time_and_others_by_rank():
+    mask = torch.zeros(120, 2, 3, dtype=torch.bool)
+    mask[::3, 0, 1] = mask[:, 1, 0] = True
+    assert Groups.of_many(mask[:30]) is None
+    groups = Groups.of_many(mask, 70)
+    assert groups is not None
+    frame, joint, _ = mask.nonzero().T
+    members: dict[int, list[int]] = {}
+    for group, where, of in zip(groups.index.tolist(), frame.tolist(), joint.tolist(), strict=True):
+        members.setdefault(group, []).append(1000 * of + where)
+    root = [own for own in members.values() if own[0] < 1000]
+    assert sorted(root)[:3] == [[0, 3], [6], [9]]  # frames 0 to 3, 4 to 7, 8 to 11
+    assert {len(own) for own in members.values() if own[0] >= 1000} == {3}
+    assert len(groups) == len(members) == 30 + 40
+
+
 def test_a_metric_of_groups_is_a_metric(rows_case):
     """Symmetric and positive, so that the steps it gives go downhill."""
     case, _ = rows_case
