@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from controlmm.generation.solvers import Progress
+from collections.abc import Callable
 
+Progress = Callable[[str, int, int], None]  # phase, steps done, steps in all
 _Phase = tuple[str, int]  # its name, and how many of that name the task had before
 _Report = tuple[str, int, int]  # phase, steps done, steps in all
 

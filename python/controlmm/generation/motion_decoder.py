@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import threading
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from controlmm.generation.clip_groups import clips_end_to_end
+from controlmm.generation.clip_groups import EndToEnd, clips_end_to_end
 from controlmm.generation.code_spread import CodeSpread
 from controlmm.generation.frozen_decoder import FrozenDecoder
+from controlmm.generation.joint_progress import Progress
 from controlmm.generation.one_thread import one_thread
 from controlmm.generation.sensitivity import WINDOW, Sensitivity, measure_sensitivity
+from controlmm.generation.side_by_side import side_by_side
 from controlmm.models.tokenizer import MotionTokenizer
 from controlmm.motion.normalizer import Normalizer
 from controlmm.nn.quantizer import ResidualQuantizer
@@ -133,7 +136,7 @@ class MotionDecoder(nn.Module):
     ) -> Float[Tensor, "B T D"]:
         """De-normalised features, each clip decoded at its own length: the same, to the bit, in any batch.
 
-        On the CPU and without gradients; :meth:`features` has neither limit.
+        On the CPU, clips side by side, and without gradients; :meth:`features` has neither limit.
         """
         frozen, step = self.frozen(), self.downsample
         if frames is None:
@@ -141,10 +144,14 @@ class MotionDecoder(nn.Module):
         channels = range(len(self.normalizer.mean))
         normalized = torch.zeros(*frames.shape, len(channels))
         tokens = frames[:, ::step]
-        for group in clips_end_to_end(tokens.sum(1).tolist(), padded=tokens.shape[1], step=step):
-            clips = latents[:, : tokens.shape[1]].flatten(0, 1)[None, group.tokens]
-            decoded, _ = frozen.forward(clips, channels, group.lengths)
-            normalized.flatten(0, 1)[group.frames] = decoded[0]
+        latents = latents[:, : tokens.shape[1]].flatten(0, 1)
+
+        def decode(group: EndToEnd, _: Progress | None) -> None:
+            decoded = frozen.forward(latents[None, group.tokens], channels, group.lengths)[0][0]
+            normalized.flatten(0, 1)[group.frames] = decoded
+
+        groups = clips_end_to_end(tokens.sum(1).tolist(), padded=tokens.shape[1], step=step)
+        side_by_side([partial(decode, group) for group in groups])
         return self.normalizer.denormalize(normalized)
 
     def forward(

@@ -18,9 +18,8 @@ from typing import Any, TypeVar
 
 import torch
 
-from controlmm.generation.joint_progress import JointProgress
+from controlmm.generation.joint_progress import JointProgress, Progress
 from controlmm.generation.one_thread import allowed_threads, take_one_core
-from controlmm.generation.solvers import Progress
 
 _Result = TypeVar("_Result")
 _Report = tuple[str, int, int]  # phase, steps done, steps in all

@@ -15,11 +15,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from controlmm.generation.code_spread import CodeSpread
+from controlmm.generation.joint_progress import Progress
 from controlmm.generation.objective import Measured, Objective
 from controlmm.generation.one_thread import one_thread
 from controlmm.generation.solvers.stopping import Reason, Solution, Stopping, Watch
-
-Progress = Callable[[str, int, int], None]  # phase, steps done, steps in all
 
 
 class Sample(NamedTuple):

@@ -18,8 +18,9 @@ from torch import Tensor
 
 from controlmm.generation.control_residuals import ControlResiduals, Probe
 from controlmm.generation.coordinate_groups import Groups
+from controlmm.generation.joint_progress import Progress
 from controlmm.generation.one_thread import one_thread
-from controlmm.generation.solvers.clip_search import ClipRecord, Progress, report, solution_of
+from controlmm.generation.solvers.clip_search import ClipRecord, report, solution_of
 from controlmm.generation.solvers.curvature import Curvature
 from controlmm.generation.solvers.known_rows import MOST_ROWS, KnownRows, ShortestWay
 from controlmm.generation.solvers.metric import Metric

@@ -8,8 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from controlmm.generation.joint_progress import Progress
 from controlmm.generation.objective import Objective
-from controlmm.generation.solvers.clip_search import Progress, Search, run_searches
+from controlmm.generation.solvers.clip_search import Search, run_searches
 from controlmm.generation.solvers.stopping import Reason, Solution, Stopping
 
 

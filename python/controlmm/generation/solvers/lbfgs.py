@@ -14,8 +14,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from controlmm.generation.joint_progress import Progress
 from controlmm.generation.objective import Objective
-from controlmm.generation.solvers.clip_search import Progress, Sample, Search, run_searches
+from controlmm.generation.solvers.clip_search import Sample, Search, run_searches
 from controlmm.generation.solvers.curvature import Curvature
 from controlmm.generation.solvers.line_search import Line, strong_wolfe
 from controlmm.generation.solvers.stopping import Reason, Solution, Stopping
