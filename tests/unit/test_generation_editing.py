@@ -5,9 +5,13 @@ from __future__ import annotations
 import pytest
 import torch
 
+import controlmm.generation.observed_logits as observed_logits_module
+from controlmm.generation.decoding_request import DecodingRequest
 from controlmm.generation.editing import EditingBudget
-from controlmm.generation.logits_editing import edit_logits
+from controlmm.generation.logits_editing import LogitsEditing, edit_logits
+from controlmm.generation.noise import ClipNoise
 from controlmm.generation.objective import ControlObjective, control_error
+from controlmm.generation.observed_logits import observed_logits
 from controlmm.models.rvq_vae import frame_mask
 
 ROUNDING = 1e-5  # of float32 gradients through the decoder in another order
@@ -63,7 +67,9 @@ def test_fresh_noise_is_drawn_for_every_gradient_step_of_the_logits():
     assert len(draws) == 7
 
 
-@pytest.mark.parametrize("budget", [{"logits_iterations": -1}, {"latent_iterations": -5}])
+@pytest.mark.parametrize(
+    "budget", [{"logits_iterations": -1}, {"latent_iterations": -5}, {"observing_steps": -1}]
+)
 def test_negative_budgets_are_refused(budget):
     with pytest.raises(ValueError, match="Iterations must not be negative"):
         EditingBudget(**budget)
@@ -151,3 +157,74 @@ def test_logits_editing_lowers_the_error_of_the_decoded_motion(scene):
     )
     before, after = (objective.value_and_gradient(x.softmax(-1) @ codes * keep)[0] for x in (logits, edited))
     assert (after < before).all()
+
+
+@pytest.fixture
+def observed(tiny_pipeline, monkeypatch):
+    """Logits, codes, and an objective whose targets other codes meet; two clips of six tokens."""
+    monkeypatch.setattr(observed_logits_module, "_NEAR", 0.001)  # an untrained decoder moves joints little
+    decoder = tiny_pipeline.decoder
+    codes = decoder.tokenizer.base_codes
+    logits, elsewhere = (random(2, 6, len(codes), seed=seed) for seed in (3, 4))
+    frames = torch.ones(2, 24, dtype=torch.bool)
+    mask = torch.zeros(2, 24, 22, 3, dtype=torch.bool)
+    mask[:, ::4, [0, 20]] = True
+    targets = decoder((4 * elsewhere).softmax(-1) @ codes, frames).detach()
+    return logits, codes, ControlObjective(decoder, targets, mask, frames)
+
+
+def expected_error(logits, codes, objective):
+    joints = objective.decoder(logits.softmax(-1) @ codes, objective.frames)
+    return control_error(joints, objective.targets, objective.mask)
+
+
+def test_observed_logits_expect_codes_nearer_to_the_targets(observed):
+    logits, codes, objective = observed
+    found = observed_logits(logits, objective, codes, torch.ones(2, 6, 1), steps=3)
+    before, after = expected_error(logits, codes, objective), expected_error(found, codes, objective)
+    assert (after < 0.9 * before).all()
+
+
+def test_tokens_that_may_not_change_are_not_observed(observed):
+    logits, codes, objective = observed
+    keep = torch.ones(2, 6, 1)
+    keep[0, :3] = keep[1] = 0
+    found = observed_logits(logits, objective, codes, keep, steps=2)
+    is_same = (found == logits).all(-1)
+    assert torch.equal(is_same, keep[..., 0] == 0)
+
+
+def test_logits_that_meet_their_targets_stay(observed):
+    logits, codes, objective = observed
+    targets = objective.decoder(logits.softmax(-1) @ codes, objective.frames).detach()
+    met = ControlObjective(objective.decoder, targets + 1e-4, objective.mask, objective.frames)
+    assert torch.equal(observed_logits(logits, met, codes, torch.ones(2, 6, 1), steps=2), logits)
+
+
+def test_nothing_is_observed_beside_other_terms(observed):
+    logits, codes, objective = observed
+
+    class Height:
+        def values(self, joints):
+            return joints[:, :, 0, 1].sum(1)
+
+        def select(self, clips):
+            return self
+
+    beside = ControlObjective(
+        objective.decoder, objective.targets, objective.mask, objective.frames, terms=[Height()]
+    )
+    assert torch.equal(observed_logits(logits, beside, codes, torch.ones(2, 6, 1), steps=2), logits)
+
+
+def test_only_clips_that_lead_more_than_the_pelvis_are_observed(observed, tiny_pipeline):
+    """Where the pelvis alone is led, it made nothing better on validation clips."""
+    logits, _, objective = observed
+    objective.mask[0, :, 1:] = False
+    request = DecodingRequest(torch.zeros(2, 4), torch.ones(2, 6, dtype=torch.bool), ClipNoise([0, 1]))
+    budget = EditingBudget(observing_steps=2)
+    editing = LogitsEditing(objective, tiny_pipeline.tokenizer, request, budget)
+    assert torch.equal(editing.within(logits, 6), logits)  # too late
+    found = editing.within(logits, 5)
+    assert torch.equal(found[0], logits[0])
+    assert not torch.equal(found[1], logits[1])

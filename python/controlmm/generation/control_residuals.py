@@ -114,7 +114,7 @@ class ControlResiduals:
     def probe(self, latents: Float[Tensor, "B L C"]) -> list[Probe]:
         """Residuals of all clips; the pass is kept for :meth:`pull`."""
         part = self.part
-        self._decoded = part.decode(latents.detach())
+        self._decoded = part.decode(latents.detach(), is_looked_at_again=True)
         self._features = self._decoded.features.requires_grad_()
         features = self._features
         if self._held is not None:

@@ -76,18 +76,24 @@ class FrozenDecoder:
         self._exits: dict[tuple[int, ...], FrozenConv] = {}
 
     def forward(
-        self, latents: Float[Tensor, "B L C"], channels: Sequence[int], lengths: Lengths = ()
+        self,
+        latents: Float[Tensor, "B L C"],
+        channels: Sequence[int],
+        lengths: Lengths = (),
+        *,
+        is_looked_at_again: bool = False,
     ) -> tuple[Float[Tensor, "B T D"], Tape]:
         """Normalised features, only ``channels`` of them, and what the Jacobian products need.
 
-        Each row is a clip, or there is one row of clips of ``lengths`` tokens. The thread's latest pass is
-        remembered: a solver's start is looked at twice and its end once more, and then only the last layer
-        is computed.
+        Each row is a clip, or there is one row of clips of ``lengths`` tokens. Latents that are looked at
+        again and again, such as a solver's start and end, take but the last layer if they were those of the
+        thread's latest such pass.
         """
-        tape = _LATEST.pass_of(self, latents, lengths)
+        tape = _LATEST.pass_of(self, latents, lengths) if is_looked_at_again else None
         if tape is None:
             tape = self._run(latents, lengths)
-            _LATEST.remember(self, latents, lengths, tape)
+            if is_looked_at_again:
+                _LATEST.remember(self, latents, lengths, tape)
         tape = replace(tape, channels=tuple(channels))
         features = self._exit_for(tape.channels).forward(tape.smooth, self._frame_lengths(tape))
         return self._own_frames(features, tape).to(latents.dtype), tape

@@ -13,12 +13,14 @@ from controlmm.generation.controlled_layers import without_base
 from controlmm.generation.decoding_request import DecodingRequest
 from controlmm.generation.editing import EditingBudget, EditingOptimizer
 from controlmm.generation.frozen_layers import FrozenMatrix
-from controlmm.generation.objective import Objective
+from controlmm.generation.objective import ControlObjective, Objective
+from controlmm.generation.observed_logits import observed_logits
 from controlmm.generation.solvers.adamw import papers_optimizer
 from controlmm.generation.solvers.gradient import plain_gradient
 from controlmm.generation.token_mixture import token_mixture
 from controlmm.models.tokenizer import MotionTokenizer
 
+_OBSERVED = 0.6  # of the decoding steps, the first ones: later ones change fewer tokens
 _OPTIMIZERS = {"adamw": papers_optimizer, "gradient": plain_gradient}
 
 
@@ -39,6 +41,8 @@ class LogitsEditing:
 
     def within(self, logits: Float[Tensor, "B L K"], step: int) -> Float[Tensor, "B L K"]:
         """Logits of decoding step ``step``, edited, unless they are the last ones and have to wait."""
+        if self.budget.observing_steps:
+            return self._observed(logits, step)
         if self.ends_with_all_layers and step == self.request.steps - 1:
             return logits
         return self._edited(logits, step)
@@ -52,6 +56,19 @@ class LogitsEditing:
         """
         finer = self.tokenizer.quantizer.lookup(without_base(ids))
         return self._edited(logits, self.request.steps - 1, finer)
+
+    def _observed(self, logits: Float[Tensor, "B L K"], step: int) -> Float[Tensor, "B L K"]:
+        """Of clips that lead more than their root, whose way asks for few other poses."""
+        objective = self.objective
+        if step >= _OBSERVED * self.request.steps or not isinstance(objective, ControlObjective):
+            return logits
+        rows = objective.mask[:, :, 1:].flatten(1).any(1).nonzero()[:, 0]
+        if not len(rows):
+            return logits
+        keep = self.request.drawn[rows, :, None].to(logits.dtype)
+        codes, steps = self.tokenizer.base_codes, self.budget.observing_steps
+        found = observed_logits(logits[rows], objective.select(rows), codes, keep, steps=steps)
+        return logits.index_copy(0, rows, found)
 
     def _edited(self, logits: Tensor, step: int, finer: Tensor | float = 0.0) -> Tensor:
         iterations, rules = self.budget.logits_iterations_in(step), self.request.rules

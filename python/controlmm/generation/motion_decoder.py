@@ -146,9 +146,10 @@ class MotionDecoder(nn.Module):
         tokens = frames[:, ::step]
         latents = latents[:, : tokens.shape[1]].flatten(0, 1)
 
-        def decode(group: EndToEnd, _: Progress | None) -> None:
-            decoded = frozen.forward(latents[None, group.tokens], channels, group.lengths)[0][0]
-            normalized.flatten(0, 1)[group.frames] = decoded
+        def decode(group: EndToEnd, _progress: Progress | None) -> None:
+            clips = latents[None, group.tokens]
+            decoded, _ = frozen.forward(clips, channels, group.lengths, is_looked_at_again=True)
+            normalized.flatten(0, 1)[group.frames] = decoded[0]
 
         groups = clips_end_to_end(tokens.sum(1).tolist(), padded=tokens.shape[1], step=step)
         side_by_side([partial(decode, group) for group in groups])

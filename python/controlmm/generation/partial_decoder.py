@@ -64,14 +64,16 @@ class PartialDecoder:
         """The same for some of the clips."""
         return PartialDecoder(self.decoder, self.joints, self.frames[clips], dtype=self._dtype)
 
-    def decode(self, latents: Float[Tensor, "B L C"]) -> Decoded:
-        """Features of the wanted joints."""
+    def decode(self, latents: Float[Tensor, "B L C"], *, is_looked_at_again: bool = False) -> Decoded:
+        """Features of the wanted joints; see :meth:`FrozenDecoder.forward`."""
         step = self.decoder.downsample
         features = latents.new_zeros(len(latents), latents.shape[1] * step, len(self.channels))
         tapes = []
         for group in self.groups:
             clips = latents.flatten(0, 1)[None, group.tokens]
-            decoded, tape = self._frozen.forward(clips, self.channels, group.lengths)
+            decoded, tape = self._frozen.forward(
+                clips, self.channels, group.lengths, is_looked_at_again=is_looked_at_again
+            )
             features.flatten(0, 1)[group.frames] = decoded[0]
             tapes.append(tape)
         return Decoded(features, tuple(tapes))
