@@ -103,18 +103,43 @@ def _write_clips(folder: Path, walk: Callable[..., torch.Tensor]) -> None:
 
 
 @pytest.mark.parametrize("block", [b for b in BLOCKS if b.language in ("bash", "python")], ids=str)
-def test_code_runs(block: Block, folder_of: Callable[[Path], Path]) -> None:
+def test_code_runs(block: Block, folder_of: Callable[[Path], Path], done_in: dict[Path, set[Block]]) -> None:
+    """A block may need what those before it made; another process may have run them, in its own folder."""
+    reason = _why_not(block)
+    if reason:
+        pytest.skip(reason)
+    folder = folder_of(block.document)
+    done = done_in.setdefault(folder, set())
+    for earlier in _blocks(block.document):
+        is_code = earlier.language in ("bash", "python") and not _why_not(earlier)
+        if is_code and earlier.line <= block.line and earlier not in done:
+            _run(earlier, folder)
+            done.add(earlier)
+
+
+@pytest.fixture(scope="module")
+def done_in() -> dict[Path, set[Block]]:
+    """Blocks that have run in a folder."""
+    return {}
+
+
+def _why_not(block: Block) -> str:
+    """Why a block is not run; empty if it is."""
     if block.note.startswith("not run: "):
-        pytest.skip(block.note.removeprefix("not run: "))
+        return block.note.removeprefix("not run: ")
     model = SHIPPED["tlcontrol" if block.note == "needs the model tlcontrol" else "controlmm"]
     has_model = (shipped_folder(model) / PIPELINE_FILE).is_file()
     if block.note.startswith("needs the model") and not has_model:
-        pytest.skip("the trained model is not in this installation")
+        return "the trained model is not in this installation"
+    return ""
+
+
+def _run(block: Block, folder: Path) -> None:
     interpreter = [sys.executable, "-c"] if block.language == "python" else ["bash", "-euo", "pipefail", "-c"]
     path = os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"]))
     done = subprocess.run(
         [*interpreter, block.quick_text],
-        cwd=folder_of(block.document),
+        cwd=folder,
         env={**os.environ, "PATH": path},
         capture_output=True,
         text=True,
