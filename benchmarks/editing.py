@@ -5,8 +5,9 @@
 
 Clips of the split, each with its own recording as target: the pelvis, each other of the six joints, one of
 their 63 combinations ("cross"), at 1, 2, 5 keyframes, a quarter and all frames. Every solver starts from the
-same tokens, those that ``accurate`` draws. Errors, seconds and evaluations are medians over clips; seconds are processor seconds of the
-editing of one clip alone, so that a busy machine does not count. FID, R-precision and the distance to the
+same tokens, those that ``accurate`` draws. Errors, seconds and evaluations are medians over clips; seconds
+are processor seconds of the editing of one clip alone, so that a busy machine does not count. FID,
+R-precision and the distance to the
 text are those of the in-project evaluator. ``paper-accurate`` takes 1,600 evaluations and logits editing of
 its own, whose time counts, so it runs on ``--slow-limit`` clips and comes last; scores that need 32 clips
 are then a dash. ``gauss-newton`` is preset ``accurate``, ``latents alone`` the same to 1 mm without
