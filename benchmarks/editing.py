@@ -3,16 +3,15 @@
     python -m benchmarks.editing --data DATA [--split test] [--limit 32] [--seed 0] [--out out/editing]
     python -m benchmarks.editing --evaluation
 
-Clips of the split, each with its own recording as target: the pelvis, each other of the six joints, one of
-their 63 combinations ("cross"), at 1, 2, 5 keyframes, a quarter and all frames. Every solver starts from the
-same tokens, those that ``accurate`` draws. Errors, seconds and evaluations are medians over clips; seconds
-are processor seconds of the editing of one clip alone, so that a busy machine does not count. FID,
-R-precision and the distance to the
-text are those of the in-project evaluator. ``paper-accurate`` takes 1,600 evaluations and logits editing of
-its own, whose time counts, so it runs on ``--slow-limit`` clips and comes last; scores that need 32 clips
-are then a dash. ``gauss-newton`` is preset ``accurate``, ``latents alone`` the same to 1 mm without
-a closed end. "Worth" are the seconds in plain evaluations of the same clip: value and gradient of the
-controlled channels.
+Clips of the split, each with its own recording as target: the pelvis, each other of the six joints, one
+of their 63 combinations ("cross"), at 1, 2, 5 keyframes, a quarter and all frames. Every solver starts
+from the same tokens, those that ``accurate`` draws. Errors, seconds and evaluations are medians over
+clips; seconds are processor seconds of the editing of one clip alone, so that a busy machine does not
+count. FID, R-precision and the distance to the text are those of the in-project evaluator.
+``paper-accurate`` takes 1,600 evaluations and logits editing of its own, whose time counts, so it runs on
+``--slow-limit`` clips and comes last; scores that need 32 clips are then a dash. ``gauss-newton`` is
+preset ``accurate``, ``latents alone`` the same to 1 mm without a closed end. "Worth" are the seconds in
+plain evaluations of the same clip: value and gradient of the controlled channels.
 
 A killed run goes on where it was, and the tables are written after every row. Two processes with different
 ``--controls`` may share ``--out``. With 32 clips and 4 slow ones, a choice of joints and keyframes takes

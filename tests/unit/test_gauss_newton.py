@@ -118,6 +118,29 @@ def test_clips_that_lie_end_to_end_are_decoded_as_each_by_itself(ends):
         assert torch.equal(whole, torch.cat(parts, 1))
 
 
+def test_latents_that_are_looked_at_again_decode_alike(monkeypatch):
+    """By other channels, after other latents, by another decoder, and after they have been written into."""
+    passes, run = [], FrozenDecoder._run
+    monkeypatch.setattr(FrozenDecoder, "_run", lambda *given: passes.append(None) or run(*given))
+    frozen, other = FrozenDecoder(make_decoder()), FrozenDecoder(make_decoder(depth=1))
+    latents = random(2, 5, 8)
+
+    def passes_for(decoder, channels):
+        before = len(passes)
+        found, tape = decoder.forward(latents, channels, is_looked_at_again=True)
+        count = len(passes) - before
+        plain, plain_tape = decoder.forward(latents, channels)
+        assert torch.equal(found, plain)
+        gradient = random(*plain.shape, seed=1)
+        assert torch.equal(decoder.pull(tape, gradient), decoder.pull(plain_tape, gradient))
+        return count
+
+    assert [passes_for(frozen, channels) for channels in (CHANNELS, (2,), CHANNELS)] == [1, 0, 0]
+    assert [passes_for(decoder, CHANNELS) for decoder in (other, frozen, frozen)] == [1, 1, 0]
+    latents[0, 0] += 1
+    assert [passes_for(frozen, CHANNELS) for _ in range(2)] == [1, 0]
+
+
 def test_a_packed_decoder_sees_new_weights(tiny_pipeline):
     decoder, latents = tiny_pipeline.decoder, random(1, 6, 16)
     before, _ = decoder.frozen().forward(latents, CHANNELS)
@@ -331,6 +354,22 @@ def test_a_clips_solution_does_not_depend_on_batch_padding_or_threads(scene, thr
             assert torch.equal(single.latents[0], together.latents[clip, :tokens])
     finally:
         torch.set_num_threads(before)
+
+
+def test_a_clips_solution_does_not_depend_on_which_joints_others_lead(scene):
+    decoder, targets, _, _, latents, keep = scene
+    frames, keep = torch.ones(3, 24, dtype=torch.bool), torch.ones_like(keep)
+    mask = torch.zeros(3, 24, 22, 3, dtype=torch.bool)
+    for clip, joints in enumerate([(0, 10, 20, 21), (11, 15), (0, 3, 5, 7, 9, 16, 18)]):
+        mask[clip, :, joints] = True
+    stopping = Stopping(iterations=8)
+    together = gauss_newton(ControlResiduals(decoder, targets, mask, frames), latents, keep, stopping)
+    for clip in range(3):
+        rows = slice(clip, clip + 1)
+        alone = ControlResiduals(decoder, targets[rows], mask[rows], frames[rows])
+        single = gauss_newton(alone, latents[rows], keep[rows], stopping)
+        assert torch.equal(single.latents[0], together.latents[clip])
+        assert torch.equal(single.losses[0], together.losses[clip])
 
 
 def test_fixed_tokens_stay_and_the_others_meet_the_target(scene):

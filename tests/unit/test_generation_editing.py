@@ -159,6 +159,11 @@ def test_logits_editing_lowers_the_error_of_the_decoded_motion(scene):
     assert (after < before).all()
 
 
+def test_logits_are_edited_or_observed():
+    with pytest.raises(ValueError, match="set `logits_iterations` or `observing_steps` to 0"):
+        EditingBudget(logits_iterations=5, observing_steps=2)
+
+
 @pytest.fixture
 def observed(tiny_pipeline, monkeypatch):
     """Logits, codes, and an objective whose targets other codes meet; two clips of six tokens."""

@@ -63,11 +63,12 @@ class ControlResiduals:
         targets: (B, T, J, 3) metres.
         mask: (B, T, J, 3), the controlled coordinates.
         frames: (B, T), the frames of each clip.
-        joints: Which joints the metric knows; by default those that some clip controls.
+        joints: Which joints the metric knows; by default those that some clip controls. All are decoded:
+            sums over fewer joints add up in another order, and clips would depend on their company.
         prefix: Latents of motions whose first ``prefix_frames`` frames are kept whatever is tried: features
             there count as constant, although tokens behind them would change them a little.
         prefix_frames: See ``prefix``.
-        naturalness: What is kept small beside the residual; all joints are decoded for it.
+        naturalness: What is kept small beside the residual.
     """
 
     def __init__(
@@ -86,8 +87,7 @@ class ControlResiduals:
         self.naturalness = naturalness
         self.led = tuple(joints or controlled_joints(mask))
         self.channels = tuple(_channels_of(self.led))
-        decoded = self.led if naturalness is None else tuple(range(mask.shape[2]))
-        self.part = PartialDecoder(decoder, decoded, frames)
+        self.part = PartialDecoder(decoder, range(mask.shape[2]), frames)
         wanted = list(self.part.joints)
         self._own = [controlled_joints(clip[None]) for clip in mask]
         self._wanted, self._controlled = targets[:, :, wanted], mask[:, :, wanted]

@@ -42,6 +42,11 @@ class EditingBudget:
     def __post_init__(self) -> None:
         if min(self.logits_iterations, self.observing_steps, self.latent_iterations) < 0:
             raise ValueError(f"Iterations must not be negative, got {self}.")
+        if self.logits_iterations and self.observing_steps:
+            raise ValueError(
+                "Logits are edited or observed: set `logits_iterations` or `observing_steps` to 0, "
+                f"got {self}."
+            )
         for name in ("logits_rate", "latent_rate"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"`{name}` must be positive, got {getattr(self, name)}.")

@@ -1,4 +1,4 @@
-"""Logits editing inside the decoding steps (ControlMM section 3.4)."""
+"""Logits editing inside the decoding steps (ControlMM section 3.4), or what takes its place."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class LogitsEditing:
         return is_wanted and self.budget.logits_iterations > 0
 
     def within(self, logits: Float[Tensor, "B L K"], step: int) -> Float[Tensor, "B L K"]:
-        """Logits of decoding step ``step``, edited, unless they are the last ones and have to wait."""
+        """Logits of decoding step ``step``, observed or edited, unless the last ones have to wait."""
         if self.budget.observing_steps:
             return self._observed(logits, step)
         if self.ends_with_all_layers and step == self.request.steps - 1:
