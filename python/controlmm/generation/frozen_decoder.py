@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from controlmm.generation.convolution_taps import Taps
 from controlmm.generation.frozen_layers import FrozenConv, Lengths
 from controlmm.generation.repeated_ends import RepeatedEnds, repeated_ends
 from controlmm.nn.conv import ConvDecoder, ResidualConvBlock, ResidualStack
@@ -70,8 +71,13 @@ class FrozenDecoder:
             [_Block(cast(ResidualConvBlock, block), dtype) for block in cast(ResidualStack, stack)]
             for stack in decoder.stacks
         ]
-        self._ups = [FrozenConv.of(cast(nn.Conv1d, up), dtype) for up in decoder.up]
-        self._smooth = FrozenConv.of(decoder.smooth, dtype)
+        ups = [Taps.of(cast(nn.Conv1d, up)) for up in decoder.up]
+        self._smooth: FrozenConv | None = FrozenConv.of(decoder.smooth, dtype)
+        if self._repeats_ends:
+            # Nothing is rectified between the last doubling and smoothing: both are one convolution but at a
+            # clip's ends, and frames there are cut off.
+            ups[-1], self._smooth = ups[-1].then(Taps.of(decoder.smooth)), None
+        self._ups = [FrozenConv.of_taps(up.of_doubled_frames(), dtype) for up in ups]
         self._exit = decoder.exit
         self._exits: dict[tuple[int, ...], FrozenConv] = {}
 
@@ -109,10 +115,11 @@ class FrozenDecoder:
                 hidden = block.dilated.forward(x.clamp_min(0), lengths, is_rectified=True)
                 saved.append((x, hidden))
                 x = x + block.pointwise.forward(hidden)
-            lengths = _twice(lengths)
-            x = up.forward(_doubled(x), lengths)
-        smooth = self._smooth.forward(x, lengths, is_rectified=True)
-        return Tape((), tape_lengths, entry, tuple(saved), smooth)
+            is_smooth = up is self._ups[-1] and self._smooth is None
+            x, lengths = _halves(up.forward(x, lengths, is_rectified=is_smooth)), _twice(lengths)
+        if self._smooth is not None:
+            x = self._smooth.forward(x, lengths, is_rectified=True)
+        return Tape((), tape_lengths, entry, tuple(saved), x)
 
     def pull(self, tape: Tape, gradient: Float[Tensor, "B T D"]) -> Float[Tensor, "B L C"]:
         """Gradient in the latents, given that in the features: the transposed Jacobian times a vector."""
@@ -122,11 +129,13 @@ class FrozenDecoder:
         lengths = scales.pop()
         gradient = self._with_frames_beyond(gradient.to(self._dtype), tape)
         gradient = self._exit_for(tape.channels).backward(gradient, lengths)
-        gradient = self._smooth.backward(_switched(gradient, tape.smooth), lengths)
+        gradient = _switched(gradient, tape.smooth)
+        if self._smooth is not None:
+            gradient = self._smooth.backward(gradient, lengths)
         saved = list(tape.blocks)
         for stack, up in zip(reversed(self._stacks), reversed(self._ups), strict=True):
-            gradient = up.backward(gradient, lengths).unflatten(1, (-1, 2)).sum(2)
             lengths = scales.pop()
+            gradient = up.backward(_pairs(gradient), lengths)
             for block in reversed(stack):
                 x, hidden = saved.pop()
                 inner = _switched(block.pointwise.backward(gradient), hidden)
@@ -145,9 +154,10 @@ class FrozenDecoder:
                 before, hidden = next(saved)
                 inner = block.dilated.forward(_switched(x, before), lengths, is_tangent=True)
                 x = x + block.pointwise.forward(_switched(inner, hidden), is_tangent=True)
-            lengths = _twice(lengths)
-            x = up.forward(_doubled(x), lengths, is_tangent=True)
-        x = _switched(self._smooth.forward(x, lengths, is_tangent=True), tape.smooth)
+            x, lengths = _halves(up.forward(x, lengths, is_tangent=True)), _twice(lengths)
+        if self._smooth is not None:
+            x = self._smooth.forward(x, lengths, is_tangent=True)
+        x = _switched(x, tape.smooth)
         x = self._exit_for(tape.channels).forward(x, lengths, is_tangent=True)
         return self._own_frames(x, tape).to(tangent.dtype)
 
@@ -184,8 +194,12 @@ class FrozenDecoder:
         return self._exits[channels]
 
 
-def _doubled(x: Float[Tensor, "B T C"]) -> Float[Tensor, "B 2T C"]:
-    return x.repeat_interleave(2, dim=1)
+def _halves(x: Float[Tensor, "B T 2C"]) -> Float[Tensor, "B 2T C"]:
+    return x.reshape(len(x), 2 * x.shape[1], -1)
+
+
+def _pairs(x: Float[Tensor, "B 2T C"]) -> Float[Tensor, "B T 2C"]:
+    return x.reshape(len(x), x.shape[1] // 2, -1)
 
 
 def _twice(lengths: Lengths) -> Lengths:
