@@ -21,6 +21,7 @@ from controlmm.ops import masked_consistency_loss, recover_joints
 
 ROUNDING = 1e-5  # of float32 sums in another order
 CHANNELS = (0, 1, 2, 3, 7, 8, 9)
+ALL = torch.arange(10)
 
 
 def random(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -210,14 +211,24 @@ def test_products_of_kinematic_rows_and_of_their_sums(rows_case):
     half = random(200, 200, seed=5).double()
     channels = (half @ half.T).reshape(10, 20, 10, 20)
     expected = jacobian @ half @ half.T @ jacobian.T
-    torch.testing.assert_close(kinematic_rows(*case).gram(channels), expected, rtol=1e-10, atol=1e-8)
+    torch.testing.assert_close(kinematic_rows(*case).gram(channels, ALL), expected, rtol=1e-10, atol=1e-8)
     groups = Groups.of_neighbours(case[2], 3)
     sums = torch.stack([groups.sum(unit) for unit in torch.eye(len(expected)).double()], dim=1)
-    summed = kinematic_rows(*case, groups).gram(channels)
+    summed = kinematic_rows(*case, groups).gram(channels, ALL)
     torch.testing.assert_close(summed, sums @ expected @ sums.T, rtol=1e-10, atol=1e-8)
     torch.testing.assert_close(
         groups.spread(torch.arange(len(sums)).double()), sums.T @ torch.arange(len(sums)).double()
     )
+
+
+def test_products_among_those_of_more_channels_and_frames(rows_case):
+    """A clip of a batch controls some of the joints that any clip controls, and is shorter than others."""
+    case, _ = rows_case
+    half = random(16 * 24, 50, seed=5).double()
+    products, columns = (half @ half.T).reshape(16, 24, 16, 24), torch.tensor([0, 1, 2, 3, 7, 8, 9, 4, 5, 6])
+    own = products[:, :20, :, :20][columns][:, :, columns].contiguous()
+    rows = kinematic_rows(*case)
+    torch.testing.assert_close(rows.gram(products, columns), rows.gram(own, ALL), rtol=1e-10, atol=1e-8)
 
 
 def test_groups_are_orthonormal_and_join_neighbours_of_one_coordinate():
@@ -253,7 +264,8 @@ def test_a_metric_of_groups_is_a_metric(rows_case):
     case, _ = rows_case
     half = random(200, 200, seed=5).double()
     groups = Groups.of_many(case[2], 20)
-    metric = Metric(kinematic_rows(*case, groups), (half @ half.T).reshape(10, 20, 10, 20), groups)
+    products = (half @ half.T).reshape(10, 20, 10, 20)
+    metric = Metric(kinematic_rows(*case, groups).gram(products, ALL), groups)
     size = int(case[2].sum())
     matrix = torch.stack([metric.weigh(unit)[1] for unit in torch.eye(size).double()])
     assert size > 40
@@ -274,7 +286,7 @@ def test_the_step_is_the_least_norm_solution():
     rows = kinematic_rows(scaled, recover_joints(scaled[None], joints=3)[0], mask, std)
     whole = torch.cat([rows.root.flatten(1), rows.local.to_dense()], dim=1) @ jacobian
     residual = random(int(mask.sum()), seed=6).double()
-    metric = Metric(rows, (jacobian @ jacobian.T).reshape(10, 20, 10, 20), damping=1e-12)
+    metric = Metric(rows.gram((jacobian @ jacobian.T).reshape(10, 20, 10, 20), ALL), damping=1e-12)
     value, weights = metric.weigh(residual)
     expected = torch.linalg.pinv(whole) @ residual
     torch.testing.assert_close(whole.T @ weights, expected, rtol=1e-5, atol=1e-7)

@@ -30,7 +30,7 @@ class Probe:
         joints: (T, J, 3) what they decode to, metres.
         mask: (T, J, 3) the controlled coordinates.
         std: (D,) of the channels.
-        columns: (D,) which they are of those that :meth:`ControlResiduals.channel_gram` knows.
+        columns: (D,) which they are of those that the residuals' metric knows.
         metres: Length of one unit of the joints.
         strain: Terms of naturalness, see :class:`Naturalness`.
     """
@@ -159,13 +159,13 @@ class ControlResiduals:
         """The unit of the latents' steps."""
         return self.decoder.spread()
 
-    def channel_gram(self, probe: Probe) -> Float[Tensor, "D T D T"]:
-        """Products of the decoder's rows for a clip, on average."""
-        frames = len(probe.features)
-        gram = self.decoder.channel_gram(self.channels, frames // self.decoder.downsample)
-        if len(probe.columns) < len(gram):
-            gram = gram[probe.columns][:, :, probe.columns]
-        return gram
+    def gram(self, probe: Probe, groups: Groups | None) -> Float[Tensor, "M M"]:
+        """Products of the Jacobian's rows for the residual, or sums of its coordinates, of a clip.
+
+        The decoder's part is that of an average clip.
+        """
+        tokens = len(probe.features) // self.decoder.downsample
+        return probe.rows(groups).gram(self.decoder.channel_gram(self.channels, tokens), probe.columns)
 
     def pull(
         self, weights: Sequence[Float[Tensor, "N"] | None], *, strained: Sequence[bool] = ()

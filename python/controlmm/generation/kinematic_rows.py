@@ -31,16 +31,30 @@ class KinematicRows:
         count, frames = len(self.root), self.root.shape[2]
         return torch.cat([self.root, self.local.to_dense().view(count, -1, frames)], dim=1).mT
 
-    def gram(self, channels: Float[Tensor, "D T D T"]) -> Float[Tensor, "N N"]:
-        """``K G K^T`` for the channels' own ``G``."""
-        frames = channels.shape[1]
-        whole = channels.reshape(channels.shape[0] * frames, -1)
-        split = 3 * frames
-        root, local = self.root.flatten(1).to(channels.dtype), self.local.to(channels.dtype)
-        cross = torch.sparse.mm(local, (root @ whole[:split, split:]).T)  # (N, N): local x root
-        own = torch.sparse.mm(local, torch.sparse.mm(local, whole[split:, split:]).T)
-        gram: Tensor = root @ whole[:split, :split] @ root.T + cross + cross.T + own
+    def gram(self, products: Float[Tensor, "E S E S"], columns: Int[Tensor, "D"]) -> Float[Tensor, "N N"]:
+        """``K G K^T``, for products ``G`` of the decoder's rows.
+
+        Args:
+            products: Of at least our frames and channels, of which the root's come first. They may take much
+                memory: nothing of them is copied but what is the root's own.
+            columns: Which channels of theirs ours are.
+        """
+        span, frames = products.shape[1], self.root.shape[2]
+        root, local = self.root.flatten(1).to(products.dtype), self._local_among(products, columns)
+        answers = torch.sparse.mm(local, products.view(-1, len(products) * span))
+        of_root = answers.view(len(root), -1, span)[:, :3, :frames].flatten(1) @ root.T
+        own = products[:3, :frames, :3, :frames].reshape(3 * frames, -1)
+        gram: Tensor = root @ own @ root.T + of_root + of_root.T + torch.sparse.mm(local, answers.T)
         return gram
+
+    def _local_among(self, products: Float[Tensor, "E S E S"], columns: Int[Tensor, "D"]) -> Tensor:
+        """``local`` with columns for all of their channels and frames."""
+        span, frames = products.shape[1], self.root.shape[2]
+        row, place = self.local.indices()
+        place = columns[3 + place // frames] * span + place % frames
+        size = (len(self.root), len(products) * span)
+        values = self.local.values().to(products.dtype)
+        return torch.sparse_coo_tensor(torch.stack([row, place]), values, size, check_invariants=False)
 
 
 def kinematic_rows(

@@ -67,8 +67,10 @@ class MotionDecoder(nn.Module):
         parameters = (p for layer in self._layers[1] for p in layer._parameters.values() if p is not None)
         return tuple(x for p in parameters for x in (p.data_ptr(), p._version))
 
-    def channel_gram(self, channels: tuple[int, ...], tokens: int) -> Float[Tensor, "D T D T"]:
+    def channel_gram(self, channels: tuple[int, ...], tokens: int) -> Float[Tensor, "D S D S"]:
         """Products of the rows of the decoder's Jacobian, in the unit of :meth:`spread`; see ``sensitivity``.
+
+        Of the frames of ``tokens`` or more.
 
         Each channel is measured once (a fraction of a second for a joint), products are remembered for some
         choices. A shorter clip takes a part of what a longer one had.
@@ -85,7 +87,7 @@ class MotionDecoder(nn.Module):
                 self._grams.pop(channels, None)
                 own = Sensitivity.joined([self._sensitivities[channel] for channel in channels])
                 self._remember(channels, own.gram(tokens))
-            return self._grams[channels][:, :frames, :, :frames]
+            return self._grams[channels]
 
     def _remember(self, channels: tuple[int, ...], gram: Float[Tensor, "D T D T"]) -> None:
         """Keep products, and forget the oldest ones that there is no more room for."""

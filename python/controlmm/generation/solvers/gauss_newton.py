@@ -229,7 +229,7 @@ class _Descent:
         """The metric of the clip as it now is; gradients of the old one cannot be compared with new ones."""
         self._way = _way(probe)
         groups = Groups.of_many(probe.mask)
-        self._metric = Metric(probe.rows(groups), self._residuals.channel_gram(probe), groups)
+        self._metric = Metric(self._residuals.gram(probe, groups), groups)
         self._memory.clear()
         self._gradient = None
 

@@ -7,13 +7,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from controlmm.generation.coordinate_groups import Groups
-from controlmm.generation.kinematic_rows import KinematicRows
 
 _DAMPING = 0.03  # times the mean of the diagonal (Levenberg and Marquardt's lambda)
 
 
 class Metric:
-    """``M = (A + damping)^-1`` for ``A = K G K^T``, the products of the Jacobian's rows.
+    """``M = (A + damping)^-1`` for ``A``, the products of the Jacobian's rows.
 
     ``J^T M r`` is the step that removes the residual and moves the latents least. Of dense controls, a few
     neighbouring frames of a coordinate form one unknown, their sum; what is left inside such a group is
@@ -22,14 +21,13 @@ class Metric:
 
     def __init__(
         self,
-        rows: KinematicRows,
-        channels: Float[Tensor, "D T D T"],
+        products: Float[Tensor, "M M"],
         groups: Groups | None = None,
         *,
         damping: float = _DAMPING,
     ) -> None:
         self._groups = groups
-        matrix = rows.gram(channels).double()
+        matrix = products.double()
         diagonal = matrix.diagonal()
         diagonal += damping * diagonal.mean()
         self._inverse = torch.cholesky_inverse(torch.linalg.cholesky(matrix))
