@@ -67,9 +67,7 @@ def test_fresh_noise_is_drawn_for_every_gradient_step_of_the_logits():
     assert len(draws) == 7
 
 
-@pytest.mark.parametrize(
-    "budget", [{"logits_iterations": -1}, {"latent_iterations": -5}, {"observing_steps": -1}]
-)
+@pytest.mark.parametrize("budget", [{"logits_iterations": -1}, {"latent_iterations": -5}])
 def test_negative_budgets_are_refused(budget):
     with pytest.raises(ValueError, match="Iterations must not be negative"):
         EditingBudget(**budget)
@@ -160,8 +158,8 @@ def test_logits_editing_lowers_the_error_of_the_decoded_motion(scene):
 
 
 def test_logits_are_edited_or_observed():
-    with pytest.raises(ValueError, match="set `logits_iterations` or `observing_steps` to 0"):
-        EditingBudget(logits_iterations=5, observing_steps=2)
+    with pytest.raises(ValueError, match="set `logits_iterations` to 0 or `observes_targets` to False"):
+        EditingBudget(logits_iterations=5, observes_targets=True)
 
 
 @pytest.fixture
@@ -185,7 +183,9 @@ def expected_error(logits, codes, objective):
 
 def test_observed_logits_expect_codes_nearer_to_the_targets(observed):
     logits, codes, objective = observed
-    found = observed_logits(logits, objective, codes, torch.ones(2, 6, 1), steps=3)
+    found = logits
+    for _ in range(3):
+        found = observed_logits(found, objective.residuals(), codes, torch.ones(2, 6, 1))
     before, after = expected_error(logits, codes, objective), expected_error(found, codes, objective)
     assert (after < 0.9 * before).all()
 
@@ -194,20 +194,28 @@ def test_tokens_that_may_not_change_are_not_observed(observed):
     logits, codes, objective = observed
     keep = torch.ones(2, 6, 1)
     keep[0, :3] = keep[1] = 0
-    found = observed_logits(logits, objective, codes, keep, steps=2)
+    found = observed_logits(logits, objective.residuals(), codes, keep)
     is_same = (found == logits).all(-1)
     assert torch.equal(is_same, keep[..., 0] == 0)
+    logits[0, 0] = random(len(codes), seed=5)
+    again = observed_logits(logits, objective.residuals(), codes, keep)
+    assert not torch.equal(again[0, 3:], found[0, 3:])  # what they decode to counts all the same
 
 
 def test_logits_that_meet_their_targets_stay(observed):
     logits, codes, objective = observed
     targets = objective.decoder(logits.softmax(-1) @ codes, objective.frames).detach()
     met = ControlObjective(objective.decoder, targets + 1e-4, objective.mask, objective.frames)
-    assert torch.equal(observed_logits(logits, met, codes, torch.ones(2, 6, 1), steps=2), logits)
+    assert torch.equal(observed_logits(logits, met.residuals(), codes, torch.ones(2, 6, 1)), logits)
 
 
-def test_nothing_is_observed_beside_other_terms(observed):
-    logits, codes, objective = observed
+def observing(tiny_pipeline, objective):
+    request = DecodingRequest(torch.zeros(2, 4), torch.ones(2, 6, dtype=torch.bool), ClipNoise([0, 1]))
+    return LogitsEditing(objective, tiny_pipeline.tokenizer, request, EditingBudget(observes_targets=True))
+
+
+def test_nothing_is_observed_beside_other_terms(observed, tiny_pipeline):
+    logits, _, objective = observed
 
     class Height:
         def values(self, joints):
@@ -219,17 +227,13 @@ def test_nothing_is_observed_beside_other_terms(observed):
     beside = ControlObjective(
         objective.decoder, objective.targets, objective.mask, objective.frames, terms=[Height()]
     )
-    assert torch.equal(observed_logits(logits, beside, codes, torch.ones(2, 6, 1), steps=2), logits)
+    assert torch.equal(observing(tiny_pipeline, beside).within(logits, 0), logits)
 
 
 def test_only_clips_that_lead_more_than_the_pelvis_are_observed(observed, tiny_pipeline):
     """Where the pelvis alone is led, it made nothing better on validation clips."""
     logits, _, objective = observed
     objective.mask[0, :, 1:] = False
-    request = DecodingRequest(torch.zeros(2, 4), torch.ones(2, 6, dtype=torch.bool), ClipNoise([0, 1]))
-    budget = EditingBudget(observing_steps=2)
-    editing = LogitsEditing(objective, tiny_pipeline.tokenizer, request, budget)
-    assert torch.equal(editing.within(logits, 6), logits)  # too late
-    found = editing.within(logits, 5)
+    found = observing(tiny_pipeline, objective).within(logits, 9)
     assert torch.equal(found[0], logits[0])
     assert not torch.equal(found[1], logits[1])

@@ -15,8 +15,8 @@ class EditingBudget:
     """How editing looks for latents, and how long.
 
     Attributes:
-        observing_steps: Of Gauss-Newton in each decoding step, towards targets that tokens should come near
-            while they are drawn, see ``generation.observed_logits``; not where there are other terms.
+        observes_targets: Whether each decoding step looks where targets want the tokens that are drawn, see
+            ``generation.observed_logits``; not where there are other terms.
         solver: "papers" takes the optimiser and the rates below; "gauss-newton", "lbfgs", or "auto", which
             chooses between them, need no rates.
         tolerance: Metres. A clip is done when it is this near its targets.
@@ -28,7 +28,7 @@ class EditingBudget:
     logits_iterations: int = 0  # in each decoding step
     logits_iterations_grow: bool = False  # step k takes k times as many: the published command's default, 35
     logits_rate: float = 0.06  # of logits editing
-    observing_steps: int = 0
+    observes_targets: bool = False
     latent_iterations: int = 100  # after the last decoding step
     latent_rate: float = 0.05  # of latent editing, in standard deviations of the base codes
     decays_rate: bool = True  # cosine decay of the latents' rate to zero; the papers keep it constant
@@ -40,11 +40,11 @@ class EditingBudget:
     naturalness: float = 0.0
 
     def __post_init__(self) -> None:
-        if min(self.logits_iterations, self.observing_steps, self.latent_iterations) < 0:
+        if min(self.logits_iterations, self.latent_iterations) < 0:
             raise ValueError(f"Iterations must not be negative, got {self}.")
-        if self.logits_iterations and self.observing_steps:
+        if self.logits_iterations and self.observes_targets:
             raise ValueError(
-                "Logits are edited or observed: set `logits_iterations` or `observing_steps` to 0, "
+                "Logits are edited or observed: set `logits_iterations` to 0 or `observes_targets` to False, "
                 f"got {self}."
             )
         for name in ("logits_rate", "latent_rate"):

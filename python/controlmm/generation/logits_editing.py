@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from controlmm.generation.control_residuals import ControlResiduals
 from controlmm.generation.controlled_layers import without_base
 from controlmm.generation.decoding_request import DecodingRequest
 from controlmm.generation.editing import EditingBudget, EditingOptimizer
@@ -20,7 +22,6 @@ from controlmm.generation.solvers.gradient import plain_gradient
 from controlmm.generation.token_mixture import token_mixture
 from controlmm.models.tokenizer import MotionTokenizer
 
-_OBSERVED = 0.6  # of the decoding steps, the first ones: later ones change fewer tokens
 _OPTIMIZERS = {"adamw": papers_optimizer, "gradient": plain_gradient}
 
 
@@ -41,8 +42,8 @@ class LogitsEditing:
 
     def within(self, logits: Float[Tensor, "B L K"], step: int) -> Float[Tensor, "B L K"]:
         """Logits of decoding step ``step``, observed or edited, unless the last ones have to wait."""
-        if self.budget.observing_steps:
-            return self._observed(logits, step)
+        if self.budget.observes_targets:
+            return self._observed(logits)
         if self.ends_with_all_layers and step == self.request.steps - 1:
             return logits
         return self._edited(logits, step)
@@ -57,18 +58,27 @@ class LogitsEditing:
         finer = self.tokenizer.quantizer.lookup(without_base(ids))
         return self._edited(logits, self.request.steps - 1, finer)
 
-    def _observed(self, logits: Float[Tensor, "B L K"], step: int) -> Float[Tensor, "B L K"]:
-        """Of clips that lead more than their root, whose way asks for few other poses."""
-        objective = self.objective
-        if step >= _OBSERVED * self.request.steps or not isinstance(objective, ControlObjective):
+    def _observed(self, logits: Float[Tensor, "B L K"]) -> Float[Tensor, "B L K"]:
+        """Of clips that lead more than their root, whose way asks for few other poses.
+
+        Not beside terms, which are no sums of squares: obstacles would be forgotten.
+        """
+        if self._residuals is None:
             return logits
-        rows = objective.mask[:, :, 1:].flatten(1).any(1).nonzero()[:, 0]
-        if not len(rows):
-            return logits
+        rows, residuals = self._residuals
         keep = self.request.drawn[rows, :, None].to(logits.dtype)
-        codes, steps = self.tokenizer.base_codes, self.budget.observing_steps
-        found = observed_logits(logits[rows], objective.select(rows), codes, keep, steps=steps)
+        found = observed_logits(logits[rows], residuals, self.tokenizer.base_codes, keep)
         return logits.index_copy(0, rows, found)
+
+    @cached_property
+    def _residuals(self) -> tuple[Int[Tensor, "N"], ControlResiduals] | None:
+        """The clips that are observed, and what should vanish of theirs."""
+        objective = self.objective
+        if not isinstance(objective, ControlObjective):
+            return None
+        rows = objective.mask[:, :, 1:].flatten(1).any(1).nonzero()[:, 0]
+        residuals = objective.select(rows).residuals() if len(rows) else None
+        return None if residuals is None else (rows, residuals)
 
     def _edited(self, logits: Tensor, step: int, finer: Tensor | float = 0.0) -> Tensor:
         iterations, rules = self.budget.logits_iterations_in(step), self.request.rules

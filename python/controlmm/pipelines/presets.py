@@ -13,7 +13,6 @@ from controlmm.ops.consistency import NORM_CODES, Norm
 
 _LENGTHS = {"m": 1.0, "mm": 0.001, "cm": 0.01}
 _TIMES = {"s": 1.0, "ms": 0.001}
-_OBSERVING_STEPS = 2  # on validation clips one did half as much, three no more
 _FEW_STEPS = 6  # of masked decoding; on validation clips no worse than the papers' ten (docs/solvers.md)
 
 
@@ -67,17 +66,33 @@ class Preset:
         return replace(self.budget, tolerance=self.closes_from)
 
 
-def _quick(iterations: int, tolerance: float, *, near: float) -> Preset:
-    """Editing with naturalness until ``near`` and a closed end; until ``tolerance`` where there is none."""
-    budget = EditingBudget(solver="auto", latent_iterations=iterations, tolerance=tolerance, naturalness=1.0)
-    return Preset(budget, steps=_FEW_STEPS, closes_from=near, is_bfloat16=True)
+def _edited(
+    iterations: int,
+    tolerance: float,
+    *,
+    near: float,
+    guided_share: float | None = None,
+    is_exact: bool = False,
+) -> Preset:
+    """Tokens drawn with an eye on the targets; latents edited with naturalness until ``near``; a closed end.
 
-
-def _thorough(iterations: int, tolerance: float, *, near: float, is_exact: bool = False) -> Preset:
-    """The same, but tokens are drawn as in the papers, with an eye on the targets."""
-    quick = _quick(iterations, tolerance, near=near)
-    budget = replace(quick.budget, observing_steps=_OBSERVING_STEPS)
-    return replace(quick, budget=budget, steps=10, guided_share=1.0, is_exact=is_exact)
+    Until ``tolerance`` where there is no closed end.
+    """
+    budget = EditingBudget(
+        observes_targets=True,
+        solver="auto",
+        latent_iterations=iterations,
+        tolerance=tolerance,
+        naturalness=1.0,
+    )
+    return Preset(
+        budget,
+        steps=_FEW_STEPS,
+        guided_share=guided_share,
+        closes_from=near,
+        is_exact=is_exact,
+        is_bfloat16=True,
+    )
 
 
 def _papers(*, logits: int = 0, codebook: int) -> Preset:
@@ -87,10 +102,10 @@ def _papers(*, logits: int = 0, codebook: int) -> Preset:
 
 # `python -m benchmarks.editing` measures them. The papers' iteration counts are there to compare with.
 PRESETS = {
-    "fast": _quick(20, 0.01, near=0.07),
-    "balanced": _quick(40, 0.003, near=0.03),
-    "accurate": _thorough(80, 0.001, near=0.02),
-    "exact": _thorough(80, 0.001, near=0.01, is_exact=True),
+    "fast": _edited(20, 0.01, near=0.07),
+    "balanced": _edited(40, 0.003, near=0.03),
+    "accurate": _edited(80, 0.001, near=0.02, guided_share=1.0),
+    "exact": _edited(80, 0.001, near=0.01, guided_share=1.0, is_exact=True),
     "paper-fast": _papers(codebook=100),
     "paper-medium": _papers(codebook=600),
     "paper-accurate": _papers(logits=100, codebook=600),
