@@ -93,14 +93,15 @@ def measure_sensitivity(
         spread: The unit of the latents' steps.
     """
     sequences, window, width = latents.shape
-    _, tape = decoder.forward(latents, channels)
+    _, tape = decoder.forward(latents, channels, is_looked_at_again=True)
     count, middle = len(channels) * downsample, window // 2 * downsample
     seeds = torch.zeros(count, window * downsample, len(channels))
     for row in range(count):
         seeds[row, middle + row % downsample, row // downsample] = 1
+    which = torch.arange(sequences).repeat_interleave(count)
+    pulled = spread.gradient(decoder.pull(tape.select(which), seeds.repeat(sequences, 1, 1)))
     total, power = torch.zeros(count, window, width), torch.zeros(count)
-    for sequence in range(sequences):
-        rows = spread.gradient(decoder.pull(tape.select(torch.full((count,), sequence)), seeds))
+    for rows in pulled.unflatten(0, (sequences, count)):
         total += rows
         power += rows.square().sum((1, 2))
     mean, shape = total / sequences, (len(channels), downsample)
