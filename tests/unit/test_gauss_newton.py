@@ -28,10 +28,12 @@ def random(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
-def make_decoder(*, depth: int = 2, is_always_on: bool = False, ends: DecoderEnds = "zeros") -> ConvDecoder:
+def make_decoder(
+    *, depth: int = 2, downsample: int = 4, is_always_on: bool = False, ends: DecoderEnds = "zeros"
+) -> ConvDecoder:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(3)
-        decoder = ConvDecoder(8, 12, width=8, depth=depth, downsample=4, dropout=0.0, ends=ends)
+        decoder = ConvDecoder(8, 12, width=8, depth=depth, downsample=downsample, dropout=0.0, ends=ends)
     if is_always_on:  # biases so large that every rectifier stays on: the decoder is linear
         for name, parameter in decoder.named_parameters():
             if name.endswith("bias"):
@@ -42,9 +44,10 @@ def make_decoder(*, depth: int = 2, is_always_on: bool = False, ends: DecoderEnd
 
 
 @pytest.mark.parametrize("ends", ["zeros", "repeat"])
+@pytest.mark.parametrize("downsample", [2, 4, 8])
 @pytest.mark.parametrize("tokens", [1, 2, 5, 13])
-def test_frozen_decoder_agrees_with_autograd(tokens, ends):
-    decoder, latents = make_decoder(ends=ends), random(3, tokens, 8)
+def test_frozen_decoder_agrees_with_autograd(tokens, downsample, ends):
+    decoder, latents = make_decoder(ends=ends, downsample=downsample), random(3, tokens, 8)
     frozen = FrozenDecoder(decoder)
     features, tape = frozen.forward(latents, CHANNELS)
     leaf = latents.clone().requires_grad_()

@@ -72,11 +72,13 @@ class FrozenDecoder:
             for stack in decoder.stacks
         ]
         ups = [Taps.of(cast(nn.Conv1d, up)) for up in decoder.up]
-        self._smooth: FrozenConv | None = FrozenConv.of(decoder.smooth, dtype)
+        self._smooth: FrozenConv | None = None
         if self._repeats_ends:
             # Nothing is rectified between the last doubling and smoothing: both are one convolution but at a
             # clip's ends, and frames there are cut off.
-            ups[-1], self._smooth = ups[-1].then(Taps.of(decoder.smooth)), None
+            ups[-1] = ups[-1].then(Taps.of(decoder.smooth))
+        else:
+            self._smooth = FrozenConv.of(decoder.smooth, dtype)
         self._ups = [FrozenConv.of_taps(up.of_doubled_frames(), dtype) for up in ups]
         self._exit = decoder.exit
         self._exits: dict[tuple[int, ...], FrozenConv] = {}
