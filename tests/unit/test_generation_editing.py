@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -207,6 +209,14 @@ def test_logits_that_meet_their_targets_stay(observed):
     targets = objective.decoder(logits.softmax(-1) @ codes, objective.frames).detach()
     met = ControlObjective(objective.decoder, targets + 1e-4, objective.mask, objective.frames)
     assert torch.equal(observed_logits(logits, met.residuals(), codes, torch.ones(2, 6, 1)), logits)
+
+
+def test_what_is_near_is_measured_in_metres(observed):
+    logits, codes, objective = observed
+    residuals = objective.residuals()
+    probe = residuals.probe(logits.softmax(-1) @ codes)[0]
+    assert observed_logits_module._force(residuals, probe) is not None
+    assert observed_logits_module._force(residuals, replace(probe, metres=1e-3)) is None
 
 
 def observing(tiny_pipeline, objective):

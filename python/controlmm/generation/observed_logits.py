@@ -47,7 +47,7 @@ def observed_logits(
 @one_thread()
 def _force(residuals: ControlResiduals, probe: Probe) -> Float[Tensor, "N"] | None:
     """On each coordinate of a clip: ``(J J^T + error)^-1 r``; ``None`` near the targets."""
-    if (3 * probe.loss) ** 0.5 < _NEAR:
+    if probe.metres * (3 * probe.loss) ** 0.5 < _NEAR:
         return None
     groups = Groups.of_many(probe.mask)
     return Metric(residuals.gram(probe, groups), groups).weigh(probe.residual)[1]
