@@ -1,4 +1,4 @@
-"""Products of rows: right, and the same to the bit in any company, also where they are few."""
+"""Products of rows: right, and the same to the bit in any company, also where there are few of anything."""
 
 from __future__ import annotations
 
@@ -18,6 +18,22 @@ def test_a_row_is_the_same_in_any_company():
         for count in (*range(1, 30), 49, 98):
             assert torch.equal(row_product(rows[:, :count], matrix), together[:, :count])
             assert torch.equal(row_product(rows[:, -count:], matrix), together[:, -count:])
+
+
+def test_a_column_is_the_same_beside_any_others():
+    generator = torch.Generator().manual_seed(2)
+    rows, matrix, bias = (torch.randn(*size, generator=generator) for size in ((40, 6, 96), (96, 70), (70,)))
+    together = row_product(rows, matrix, bias)
+    torch.testing.assert_close(together, rows @ matrix + bias, rtol=ROUNDING, atol=10 * ROUNDING)
+    for first, end in ((0, 1), (3, 10), (30, 41), (5, 21), (1, 70)):
+        part = row_product(rows[:7], matrix[:, first:end].contiguous(), bias[first:end])
+        assert torch.equal(part, together[:7, :, first:end])
+
+
+def test_how_rows_lie_in_memory_does_not_matter():
+    rows = torch.randn(200, 64, generator=torch.Generator().manual_seed(3))
+    matrix = torch.randn(64, 20, generator=torch.Generator().manual_seed(4))
+    assert torch.equal(row_product(rows.T.contiguous().T, matrix), row_product(rows, matrix))
 
 
 def test_rows_have_gradients():

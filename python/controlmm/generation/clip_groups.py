@@ -14,12 +14,13 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-_TOGETHER = 8  # of 196 frames: what a layer makes of them stays in a processor's caches
-_TOKENS = 392  # of as many
+_TOGETHER = 16  # of 196 frames: what a layer makes of them stays in a processor's caches
+_TOKENS = 784  # of as many
+_GROUP = 96  # tokens that take as long as what a group costs however small it is
 
 
 def clips_by_length(lengths: Sequence[int]) -> list[tuple[int, Int[Tensor, "N"]]]:
-    """(length, clips) of up to eight clips each; every clip is in one of the groups."""
+    """(length, clips) of up to sixteen clips each; every clip is in one of the groups."""
     rows: dict[int, list[int]] = {}
     for clip, length in enumerate(lengths):
         rows.setdefault(length, []).append(clip)
@@ -31,13 +32,19 @@ def clips_by_length(lengths: Sequence[int]) -> list[tuple[int, Int[Tensor, "N"]]
 
 
 def clips_of_like_length(lengths: Sequence[int]) -> list[Int[Tensor, "N"]]:
-    """All clips, from the shortest on, as many in a group as networks take well; padding counts."""
-    groups: list[list[int]] = []
-    for clip in sorted(range(len(lengths)), key=lambda clip: lengths[clip]):
-        if not groups or (len(groups[-1]) + 1) * lengths[clip] > _TOKENS:
-            groups.append([])
-        groups[-1].append(clip)
-    return [torch.tensor(clips) for clips in groups]
+    """All clips in groups whose cost is least: tokens, padding included, and what a group costs by itself."""
+    order = sorted(range(len(lengths)), key=lambda clip: lengths[clip])
+    ways = [(0, 0)]  # for the first clips of the order: the least cost, and where the last group starts
+    for end in range(1, len(order) + 1):
+        longest = lengths[order[end - 1]]
+        starts = range(max(0, end - max(1, _TOKENS // longest)), end)
+        ways.append(min((ways[start][0] + (end - start) * longest + _GROUP, start) for start in starts))
+    groups, end = [], len(order)
+    while end:
+        start = ways[end][1]
+        groups.append(torch.tensor(order[start:end]))
+        end = start
+    return groups[::-1]
 
 
 @dataclass(frozen=True, eq=False)

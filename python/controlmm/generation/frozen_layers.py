@@ -1,102 +1,23 @@
-"""Convolutions with frozen weights as matrix products, weights packed once: what editing spends its time in.
+"""Convolutions with frozen weights as matrix products: what editing spends its time in.
 
 An editing step needs no gradient of the weights, so a convolution is a product with one matrix on the way
-forward and with another on the way back, and both can be brought into the order that the processor likes
-before the first step. oneDNN's packed products also give a clip the same numbers, bit by bit, in any batch
-and with any number of threads.
+forward and with another on the way back, and both are prepared before the first step.
 """
 
 from __future__ import annotations
 
 import math
-import os
 import threading
 from functools import lru_cache
-from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from controlmm.generation.convolution_taps import Taps
+from controlmm.generation.frozen_matrix import Activation, FrozenMatrix
 
-_TYPICAL_ROWS = 196  # the frames of one clip: what packing prepares for
-# Wider products in bfloat16 are sums of narrower ones: oneDNN would sum a row in an order that depends on how
-# many rows there are.
-_WIDEST_BFLOAT16 = 256
-
-Activation = Literal["none", "relu", "gelu"]
 Lengths = tuple[int, ...]  # of clips that lie end to end
-
-
-def has_fast_bfloat16() -> bool:
-    """Whether this processor multiplies bfloat16 in tiles (AMX), and ``CONTROLMM_BFLOAT16`` is not 0."""
-    return (
-        os.environ.get("CONTROLMM_BFLOAT16") != "0"
-        and bool(torch.cpu._is_amx_tile_supported())
-        and _packed(torch.zeros(16, 16, dtype=torch.bfloat16)) is not None
-    )
-
-
-class FrozenMatrix:
-    """``x -> x W^T + b`` with a packed ``W``."""
-
-    def __init__(
-        self, weight: Float[Tensor, "out in"], bias: Float[Tensor, "out"] | None, dtype: torch.dtype
-    ) -> None:
-        weight = weight.detach().to(dtype)
-        self._bias = None if bias is None else bias.detach().to(dtype)
-        count = -(-weight.shape[1] // _WIDEST_BFLOAT16) if dtype == torch.bfloat16 else 1
-        self._widths = [part.shape[1] for part in weight.tensor_split(count, dim=1)]
-        self._parts = [_Columns(part.contiguous()) for part in weight.split(self._widths, dim=1)]
-
-    def __call__(
-        self, x: Float[Tensor, "N in"], *, activation: Activation = "none", is_tangent: bool = False
-    ) -> Float[Tensor, "N out"]:
-        """The product after an activation; of a tangent: without the bias."""
-        bias = None if is_tangent else self._bias
-        first, *others = self._parts
-        if not others:
-            return first.product(x, bias, activation)
-        inputs = x.split(self._widths, dim=1)
-        total = first.product(inputs[0], bias).float()
-        for part, columns in zip(inputs[1:], others, strict=True):
-            total += columns.product(part, None)
-        return _activated(total, activation).to(x.dtype)
-
-
-class _Columns:
-    """Some columns of a matrix, packed where this torch and processor can."""
-
-    def __init__(self, weight: Float[Tensor, "out in"]) -> None:
-        self._packed = _packed(weight)
-        self._transposed = weight.t().contiguous() if self._packed is None else None
-
-    def product(self, x: Tensor, bias: Tensor | None, activation: Activation = "none") -> Tensor:
-        if self._transposed is not None:
-            plain = x @ self._transposed if bias is None else torch.addmm(bias, x, self._transposed)
-            return _activated(plain, activation)
-        fused = "none" if activation == "gelu" else activation  # torch's own takes a third of oneDNN's time
-        result: Tensor = torch.ops.mkldnn._linear_pointwise(x, self._packed, bias, fused, [], "")
-        return nn.functional.gelu(result) if activation == "gelu" else result
-
-
-def _activated(x: Tensor, activation: Activation) -> Tensor:
-    if activation == "relu":
-        return x.clamp_min_(0)
-    return nn.functional.gelu(x) if activation == "gelu" else x
-
-
-def _packed(weight: Tensor) -> Tensor | None:
-    """``weight`` in oneDNN's order; ``None`` where this torch or processor cannot."""
-    if weight.dtype == torch.float64 or not torch.backends.mkldnn.is_available():
-        return None
-    try:
-        packed: Tensor = torch.ops.mkldnn._reorder_linear_weight(weight, _TYPICAL_ROWS)
-        torch.ops.mkldnn._linear_pointwise(weight.new_zeros(1, weight.shape[1]), packed, None, "none", [], "")
-    except (AttributeError, RuntimeError):  # the operators are private: other versions may lack them
-        return None
-    return packed
 
 
 class FrozenConv:

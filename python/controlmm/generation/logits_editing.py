@@ -14,7 +14,7 @@ from controlmm.generation.control_residuals import ControlResiduals
 from controlmm.generation.controlled_layers import without_base
 from controlmm.generation.decoding_request import DecodingRequest
 from controlmm.generation.editing import EditingBudget, EditingOptimizer
-from controlmm.generation.frozen_layers import FrozenMatrix
+from controlmm.generation.frozen_matrix import FrozenMatrix
 from controlmm.generation.objective import ControlObjective, Objective
 from controlmm.generation.observed_logits import observed_logits
 from controlmm.generation.solvers.adamw import papers_optimizer

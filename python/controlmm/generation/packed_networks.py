@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn.functional import layer_norm, pad, scaled_dot_product_attention
 
 from controlmm.generation.clip_groups import clips_by_length
-from controlmm.generation.frozen_layers import Activation, FrozenMatrix
+from controlmm.generation.frozen_matrix import Activation, FrozenMatrix
 
 _HEAD = "head"  # makes the logits, whose differences count: float32 always
 _Network = TypeVar("_Network", bound=nn.Module)

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from controlmm.controls import Avoid, Control, Objective, Obstacle
-from controlmm.generation.frozen_layers import has_fast_bfloat16
+from controlmm.generation.frozen_matrix import has_fast_bfloat16
 from controlmm.generation.latent_editing import edit_latents
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.objective import ControlObjective
