@@ -14,6 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from controlmm.nn.row_product import row_product
+
 _LEAST_VARIANCE = (
     0.01  # of a direction, as a share of the mean: those that codes leave out cost ten times more
 )
@@ -41,8 +43,8 @@ class CodeSpread:
 
     def change(self, steps: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
         """What steps in standard deviations change of the latents."""
-        return steps @ self.matrix
+        return row_product(steps, self.matrix)
 
     def gradient(self, gradient: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
         """A gradient in the steps, given that in the latents."""
-        return gradient @ self.matrix
+        return row_product(gradient, self.matrix)

@@ -89,9 +89,11 @@ class ControlResiduals:
         self.channels = tuple(_channels_of(self.led))
         self.part = PartialDecoder(decoder, range(mask.shape[2]), frames)
         wanted = list(self.part.joints)
-        self._own = [controlled_joints(clip[None]) for clip in mask]
-        self._wanted, self._controlled = targets[:, :, wanted], mask[:, :, wanted]
-        self._lengths: list[int] = frames.sum(1).tolist()
+        self._wanted, controlled = targets[:, :, wanted], mask[:, :, wanted]
+        self._views = [
+            _View.of(clip[:length], self.part.joints, self.led)
+            for clip, length in zip(controlled, frames.sum(1).tolist(), strict=True)
+        ]
         self._prefix = prefix
         self._held: Tensor | None = None
         if prefix is not None:
@@ -133,17 +135,15 @@ class ControlResiduals:
 
     def _probe(self, clip: int, features: Tensor, difference: Tensor, strain: float) -> Probe:
         """One clip's part; the metric looks at joints that it controls only."""
-        part, length = self.part, self._lengths[clip]
-        own = self._own[clip]
-        places = [part.joints.index(joint) for joint in own]
-        columns = _channels_of(places)
+        view = self._views[clip]
+        length = len(view.mask)
         return Probe(
-            difference[clip][self._controlled[clip]].double(),
-            features[clip, :length][:, columns],
-            self._joints.detach()[clip, :length][:, places],
-            self._controlled[clip, :length][:, places],
-            part.std[columns],
-            torch.tensor(_channels_of([self.led.index(joint) for joint in own])),
+            difference[clip].flatten()[view.coordinates].double(),
+            features[clip, :length].index_select(1, view.channels),
+            self._joints.detach()[clip, :length].index_select(1, view.joints),
+            view.mask,
+            self.part.std[view.channels],
+            view.columns,
             self.decoder.normalizer.skeleton.metres,
             strain,
         )
@@ -151,8 +151,7 @@ class ControlResiduals:
     @property
     def coordinates(self) -> list[int]:
         """How many each clip controls."""
-        counts: list[int] = self._controlled.flatten(1).sum(1).tolist()
-        return counts
+        return [len(view.coordinates) for view in self._views]
 
     @property
     def spread(self) -> CodeSpread:
@@ -177,7 +176,7 @@ class ControlResiduals:
         gradient = torch.zeros_like(self._joints)
         for clip, wanted in enumerate(weights):
             if wanted is not None:
-                gradient[clip][self._controlled[clip]] = wanted.float()
+                gradient[clip].view(-1)[self._views[clip].coordinates] = wanted.float()
         outputs, slopes = [self._joints], [gradient]
         if self._strains is not None and any(strained):
             outputs.append(self._strains)
@@ -195,6 +194,39 @@ class ControlResiduals:
         if self._held is not None:
             rows[:, : self._held.shape[1]] = 0
         return self.part.pull_rows(self._decoded, clip, rows, [self.channels[i] for i in probe.columns])
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """What the metric looks at of a clip: the joints that it controls.
+
+    Attributes:
+        coordinates: Where the controlled ones are in the clip's flattened joints.
+        joints: Which of the decoded joints.
+        channels: Which of the decoded channels.
+        columns: Which they are of those that the residuals' metric knows.
+        mask: (T, J, 3) the controlled coordinates of these joints.
+    """
+
+    coordinates: Int[Tensor, "N"]
+    joints: Int[Tensor, "J"]
+    channels: Int[Tensor, "D"]
+    columns: Int[Tensor, "D"]
+    mask: Bool[Tensor, "T J 3"]
+
+    @classmethod
+    def of(cls, controlled: Bool[Tensor, "T J 3"], decoded: Sequence[int], led: Sequence[int]) -> _View:
+        """Of a clip's mask for the joints that are ``decoded``."""
+        places = controlled_joints(controlled[None])
+        own = [decoded[place] for place in places]
+        columns = _channels_of([led.index(joint) for joint in own])
+        return cls(
+            controlled.flatten().nonzero()[:, 0],
+            torch.tensor(places),
+            torch.tensor(_channels_of(places)),
+            torch.tensor(columns),
+            controlled[:, list(places)],
+        )
 
 
 def _channels_of(joints: Sequence[int]) -> list[int]:

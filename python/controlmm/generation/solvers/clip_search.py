@@ -14,11 +14,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from controlmm.generation.code_spread import CodeSpread
 from controlmm.generation.joint_progress import Progress
 from controlmm.generation.objective import Measured, Objective
 from controlmm.generation.one_thread import one_thread
 from controlmm.generation.solvers.stopping import Reason, Solution, Stopping, Watch
+from controlmm.generation.solvers.unknowns import Unknowns
 
 
 class Sample(NamedTuple):
@@ -32,49 +32,21 @@ Search = Generator[Float[Tensor, "N"], Sample, Reason]
 
 
 class ClipRecord:
-    """One clip on its way: its unknowns and its best iterate.
+    """One clip on its way: its best iterate, and what led to it."""
 
-    Unknown are the latents of the tokens that may change or, given a ``spread``, their changes in its unit.
-    """
-
-    def __init__(
-        self, latents: Float[Tensor, "L C"], keep: Float[Tensor, "L 1"], spread: CodeSpread | None = None
-    ) -> None:
-        self.is_free, self._spread = keep[:, 0] > 0, spread
-        self.start: Tensor = latents[self.is_free].flatten()
-        if spread is not None:
-            self.start = torch.zeros_like(self.start)
-        self._best, self._best_loss = self.start, math.inf
+    def __init__(self, start: Float[Tensor, "N"]) -> None:
+        self.best, self._best_loss = start, math.inf
         self.losses: list[float] = []
         self.errors: list[float] = []
         self.reason: Reason | None = None
 
-    def judge(self, point: Tensor, loss: float, error: float | None) -> None:
+    def judge(self, point: Float[Tensor, "N"], loss: float, error: float | None) -> None:
         """Write an evaluation down."""
         self.losses.append(loss)
         if error is not None:
             self.errors.append(error)
         if loss < self._best_loss:
-            self._best, self._best_loss = point, loss
-
-    @one_thread()
-    def placed(self, point: Tensor, latents: Float[Tensor, "L C"]) -> Float[Tensor, "L C"]:
-        """``latents`` with the unknowns replaced by ``point``."""
-        placed, rows = latents.clone(), point.unflatten(0, (-1, latents.shape[-1]))
-        placed[self.is_free] = (
-            rows if self._spread is None else latents[self.is_free] + self._spread.change(rows)
-        )
-        return placed
-
-    @one_thread()
-    def gradient(self, gradient: Float[Tensor, "L C"]) -> Float[Tensor, "N"]:
-        """The gradient in the unknowns, given that in the latents."""
-        rows = gradient[self.is_free]
-        return (rows if self._spread is None else self._spread.gradient(rows)).flatten()
-
-    def best_in(self, latents: Float[Tensor, "L C"]) -> Float[Tensor, "L C"]:
-        """``latents`` with the best iterate in its place."""
-        return self.placed(self._best, latents)
+            self.best, self._best_loss = point, loss
 
 
 def run_searches(
@@ -84,22 +56,22 @@ def run_searches(
     keep: Float[Tensor, "B L 1"],
     stopping: Stopping,
     *,
-    spread: CodeSpread | None = None,
     progress: Progress | None = None,
 ) -> Solution:
     """Drive ``search`` from the latents of every clip until each of them stops."""
-    latents = latents.detach()
-    records = [ClipRecord(clip, kept, spread) for clip, kept in zip(latents, keep, strict=True)]
+    unknowns = Unknowns(latents, keep)
+    starts = unknowns.starts
+    records = [ClipRecord(start) for start in starts]
     watch = Watch(stopping)
-    searches = {row: search(record.start) for row, record in enumerate(records)}
+    searches = {row: search(start) for row, start in enumerate(starts)}
     points = {row: next(running) for row, running in searches.items()}
     selected, rows = objective, list(points)
     while points:
         if rows != list(points):
             rows = list(points)
             selected = objective.select(torch.tensor(rows))
-        batch = torch.stack([records[row].placed(point, latents[row]) for row, point in points.items()])
-        losses, gradients = selected.value_and_gradient(batch)
+        losses, slopes = selected.value_and_gradient(unknowns.placed(list(points.values()), rows))
+        gradients = unknowns.gradients(slopes, rows)
         errors = selected.errors().tolist() if isinstance(selected, Measured) else [None] * len(rows)
         for row, loss, error, gradient in zip(rows, losses.tolist(), errors, gradients, strict=True):
             record = records[row]
@@ -108,11 +80,11 @@ def run_searches(
             if record.reason is None:
                 try:
                     with one_thread():
-                        points[row] = searches[row].send(Sample(loss, record.gradient(gradient)))
+                        points[row] = searches[row].send(Sample(loss, gradient))
                 except StopIteration as stop:
                     record.reason = stop.value
         report(progress, max(len(record.losses) for record in records), stopping)
-    return solution_of(records, latents, watch)
+    return solution_of(records, unknowns, watch)
 
 
 def report(progress: Progress | None, evaluations: int, stopping: Stopping) -> None:
@@ -123,15 +95,13 @@ def report(progress: Progress | None, evaluations: int, stopping: Stopping) -> N
         progress("codebook editing", min(evaluations - 1, total), total)
 
 
-def solution_of(records: list[ClipRecord], latents: Float[Tensor, "B L C"], watch: Watch) -> Solution:
+def solution_of(records: list[ClipRecord], unknowns: Unknowns, watch: Watch) -> Solution:
     """The best iterates and what led to them."""
-    if not records:
-        return Solution(latents, (), (), torch.zeros(0, dtype=torch.int64), (), watch.seconds)
     return Solution(
-        latents=torch.stack([record.best_in(clip) for record, clip in zip(records, latents, strict=True)]),
+        latents=unknowns.placed([record.best for record in records], range(len(records))),
         losses=tuple(torch.tensor(record.losses) for record in records),
         errors=tuple(torch.tensor(record.errors) for record in records),
-        evaluations=torch.tensor([len(record.losses) for record in records]),
+        evaluations=torch.tensor([len(record.losses) for record in records], dtype=torch.int64),
         reasons=tuple(record.reason or "converged" for record in records),
         seconds=watch.seconds,
     )

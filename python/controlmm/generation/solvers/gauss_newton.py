@@ -26,6 +26,7 @@ from controlmm.generation.solvers.known_rows import MOST_ROWS, KnownRows, Shorte
 from controlmm.generation.solvers.metric import Metric
 from controlmm.generation.solvers.natural_way import NaturalWay, natural_steps
 from controlmm.generation.solvers.stopping import Reason, Solution, Stopping, Watch
+from controlmm.generation.solvers.unknowns import Unknowns
 
 _EARLY_RENEWALS, _STEPS_OF_A_METRIC = (2, 5), 10  # steps after which a metric may be made anew
 _STALE = 0.1  # metres of the way or radians of the heading: by so much less, an old metric is as good
@@ -53,18 +54,18 @@ def gauss_newton(
             own Jacobian is not counted.
         progress: Called after every evaluation.
     """
-    latents = latents.detach()
-    records = [ClipRecord(clip, kept, residuals.spread) for clip, kept in zip(latents, keep, strict=True)]
+    unknowns = Unknowns(latents, keep, residuals.spread)
+    starts = unknowns.starts
+    records = [ClipRecord(start) for start in starts]
     descents = [
-        _Descent(record.start, residuals, stopping.iterations, coordinates=count)
-        for record, count in zip(records, residuals.coordinates, strict=True)
+        _Descent(start, residuals, stopping.iterations, coordinates=count)
+        for start, count in zip(starts, residuals.coordinates, strict=True)
     ]
     watch = Watch(stopping)
     selected, active = residuals, list(range(len(records)))
     while active:
-        points = [records[row].placed(descents[row].point, latents[row]) for row in active]
         wanted: list[Tensor | None] = []
-        probes = selected.probe(torch.stack(points))
+        probes = selected.probe(unknowns.placed([descents[row].point for row in active], active))
         for place, (row, probe) in enumerate(zip(active, probes, strict=True)):
             record, descent = records[row], descents[row]
             error = (3 * probe.loss) ** 0.5
@@ -72,20 +73,21 @@ def gauss_newton(
             record.reason = watch.verdict(loss=probe.loss, error=error, evaluations=len(record.losses))
             wanted.append(descent.see(probe) if record.reason is None else None)
             if descent.asks_for_rows:
-                rows = selected.jacobian(place, probe)
-                descent.know(torch.stack([record.gradient(gradient) for gradient in rows]), probe)
+                slopes = selected.jacobian(place, probe)
+                descent.know(torch.stack(unknowns.gradients(slopes, [row] * len(slopes))), probe)
         if any(weights is not None for weights in wanted):
-            gradients = selected.pull(wanted, strained=[descents[row].is_natural for row in active])
+            slopes = selected.pull(wanted, strained=[descents[row].is_natural for row in active])
+            gradients = unknowns.gradients(slopes, active)
             for row, weights, gradient in zip(active, wanted, gradients, strict=True):
                 if weights is not None:
-                    descents[row].turn(records[row].gradient(gradient))
+                    descents[row].turn(gradient)
         for row in active:
             records[row].reason = records[row].reason or descents[row].reason
         still = [row for row in active if records[row].reason is None]
         if still != active:
             active, selected = still, residuals.select(torch.tensor(still, dtype=torch.int64))
         report(progress, max(len(record.losses) for record in records), stopping)
-    return solution_of(records, latents, watch)
+    return solution_of(records, unknowns, watch)
 
 
 class _Descent:
