@@ -13,7 +13,8 @@ add_library(controlmm_kernels STATIC
   ${csrc}/runtime/kinematics.cpp
   ${csrc}/runtime/obstacle_arguments.cpp
   ${csrc}/runtime/obstacles.cpp
-  ${csrc}/runtime/parallel.cpp)
+  ${csrc}/runtime/parallel.cpp
+  ${csrc}/runtime/winograd.cpp)
 add_library(controlmm::kernels ALIAS controlmm_kernels)
 set_target_properties(controlmm_kernels PROPERTIES POSITION_INDEPENDENT_CODE ON EXPORT_NAME kernels)
 target_compile_definitions(controlmm_kernels PRIVATE CONTROLMM_VERSION="${PROJECT_VERSION}")

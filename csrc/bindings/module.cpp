@@ -139,6 +139,15 @@ void register_kernels(Module& m) {
                     {stiffness, foot_resistance, 0, standing, 0, 0, 0}, slack, enough, longest, steps, joints.view());
       },
       Unlocked());
+  m.def(
+      "winograd_parts", [](Arg x, Arg rows, Arg parts) { winograd_parts(x.view(), rows.view(), parts.view()); },
+      Unlocked());
+  m.def(
+      "winograd_frames",
+      [](Arg products, Arg rows, Arg bias, bool is_rectified, Arg y) {
+        winograd_frames(products.view(), rows.view(), bias.view(), is_rectified, y.view());
+      },
+      Unlocked());
 }
 
 }  // namespace

@@ -40,13 +40,14 @@ namespace {
 #include "projection.inl"
 #include "smooth_bones.inl"
 #include "frame_bones.inl"
+#include "winograd.inl"
 // clang-format on
 
 template <class T>
 constexpr Kernels<T> kernels() {
-  return {&recover_joints<T>, &recover_joints_backward<T>, &consistency<T>, &consistency_backward<T>,
-          &obstacle_loss<T>,  &obstacle_loss_backward<T>,  &gumbel<T>,      &softmax_backward<T>,
-          &guidance<T>};
+  return {&recover_joints<T>, &recover_joints_backward<T>, &consistency<T>,    &consistency_backward<T>,
+          &obstacle_loss<T>,  &obstacle_loss_backward<T>,  &gumbel<T>,         &softmax_backward<T>,
+          &guidance<T>,       &winograd_parts<T>,          &winograd_frames<T>};
 }
 
 }  // namespace

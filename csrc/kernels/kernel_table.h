@@ -109,6 +109,24 @@ struct SoftmaxArgs {
   T* gradient;
 };
 
+template <class T>
+struct WinogradPartsArgs {
+  std::int64_t tiles, channels;
+  const std::int64_t* rows;  // [tiles, 6], -1 for zeros
+  const T *x, *zeros;        // row-major [frames, channels]; a row
+  T* parts;                  // row-major [6, tiles, channels]
+};
+
+template <class T>
+struct WinogradFramesArgs {
+  std::int64_t tiles, channels;
+  const std::int64_t* rows;  // [tiles, 4], -1 for what nobody wants
+  const T* products;         // row-major [6, tiles, channels]
+  const T* bias;
+  bool is_rectified;
+  T *y, *discarded;  // row-major [frames, channels]; a row
+};
+
 /// Joints of a clip and the tree of their bones; a parent comes before its children, the root has -1.
 struct BodyTree {
   std::int64_t frames, joints;
@@ -157,6 +175,8 @@ struct Kernels {
   void (*gumbel)(const GumbelArgs<T>&, ClipRange rows);
   void (*softmax_backward)(const SoftmaxArgs<T>&, ClipRange rows);
   void (*guidance)(const GuidanceArgs<T>&, ClipRange, double* scratch);
+  void (*winograd_parts)(const WinogradPartsArgs<T>&);
+  void (*winograd_frames)(const WinogradFramesArgs<T>&);
 };
 
 struct ExactKernels {

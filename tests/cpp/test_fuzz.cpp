@@ -3,6 +3,7 @@
 #include <limits>
 #include <memory>
 #include <random>
+#include <stdexcept>
 #include <vector>
 
 #include "check.h"
@@ -188,6 +189,33 @@ void fuzz_exact() {
                          steps, frame.view);
 }
 
+template <class T>
+void fuzz_winograd() {
+  const std::int64_t frames = pick(0, 30), inputs = pick(0, 40), outputs = pick(0, 40);
+  const std::int64_t tiles = (frames + 3) / 4 + pick(0, 2);
+  const auto taken = row_major_block<std::int64_t>({tiles, 6}), made = row_major_block<std::int64_t>({tiles, 4});
+  for (std::int64_t i = 0; i < 6 * tiles; ++i) taken.data[static_cast<std::size_t>(i)] = pick(-1, frames - 1);
+  std::vector<std::int64_t> places(static_cast<std::size_t>(4 * tiles));
+  for (std::size_t i = 0; i < places.size(); ++i)
+    places[i] = static_cast<std::int64_t>(i) < frames ? static_cast<std::int64_t>(i) : -1;
+  std::shuffle(places.begin(), places.end(), random_bits);
+  std::copy(places.begin(), places.end(), made.data.get());
+  const auto x = row_major_block<T>({frames, inputs}), parts = row_major_block<T>({6, tiles, inputs});
+  controlmm::winograd_parts(x.view, taken.view, parts.view);
+  const auto products = row_major_block<T>({6, tiles, outputs}), y = row_major_block<T>({frames, outputs});
+  const auto bias = row_major_block<T>({pick(0, 1) == 0 ? 0 : outputs});
+  controlmm::winograd_frames(products.view, made.view, bias.view, pick(0, 1) == 0, y.view);
+  if (frames == 0) return;
+  made.data[0] = frames;
+  bool is_refused = false;
+  try {
+    controlmm::winograd_frames(products.view, made.view, bias.view, false, y.view);
+  } catch (const std::invalid_argument&) {
+    is_refused = true;
+  }
+  CHECK(is_refused);
+}
+
 }  // namespace
 
 int main() {
@@ -198,6 +226,8 @@ int main() {
       fuzz_kinematics<double>();
       fuzz_losses<float>();
       fuzz_losses<double>();
+      fuzz_winograd<float>();
+      fuzz_winograd<double>();
       fuzz_gumbel<float>();
       fuzz_gumbel<double>();
       fuzz_exact();

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from controlmm.nn.row_product import row_product
+from controlmm.nn.row_product import row_product, row_products
 
 ROUNDING = 1e-5  # of float32 sums of 512 products
 
@@ -34,6 +34,15 @@ def test_how_rows_lie_in_memory_does_not_matter():
     rows = torch.randn(200, 64, generator=torch.Generator().manual_seed(3))
     matrix = torch.randn(64, 20, generator=torch.Generator().manual_seed(4))
     assert torch.equal(row_product(rows.T.contiguous().T, matrix), row_product(rows, matrix))
+
+
+def test_several_products_at_once_are_what_each_is_alone():
+    generator = torch.Generator().manual_seed(5)
+    for rows, width in ((40, 30), (3, 48), (27, 5)):
+        x = torch.randn(6, rows, 64, generator=generator)
+        matrices = torch.randn(6, 64, width, generator=generator)
+        for part, matrix, product in zip(x, matrices, row_products(x, matrices), strict=True):
+            assert torch.equal(product, row_product(part, matrix))
 
 
 def test_rows_have_gradients():

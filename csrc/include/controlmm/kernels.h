@@ -163,4 +163,19 @@ void frame_bones(const TensorView& parents, const TensorView& lengths, const Ten
                  const TensorView& planted, const TensorView& feet, const PoseWeights& weights, double slack,
                  double enough, double longest, std::int64_t steps, const TensorView& joints);
 
+/// A convolution over time of width 3 by Winograd's F(4, 3), but for its products: what they take, see
+/// `winograd_parts`.
+/// @param x     Row-major [frames, channels].
+/// @param rows  Row-major int64 [tiles, 6]: the frames of a tile, -1 for zeros.
+/// @param parts Row-major [6, tiles, channels].
+void winograd_parts(const TensorView& x, const TensorView& rows, const TensorView& parts);
+
+/// What the products make, see `winograd_frames`.
+/// @param products Row-major [6, tiles, channels].
+/// @param rows     Row-major int64 [tiles, 4]: the frames that a tile makes, -1 for none; each frame is made once.
+/// @param bias     [channels], or none for no bias.
+/// @param y        Row-major [frames, channels].
+void winograd_frames(const TensorView& products, const TensorView& rows, const TensorView& bias, bool is_rectified,
+                     const TensorView& y);
+
 }  // namespace controlmm

@@ -14,6 +14,8 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+Lengths = tuple[int, ...]  # of clips that lie end to end
+
 _TOGETHER = 16  # of 196 frames: what a layer makes of them stays in a processor's caches
 _TOKENS = 784  # of as many
 _GROUP = 96  # tokens that take as long as what a group costs however small it is

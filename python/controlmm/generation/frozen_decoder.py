@@ -16,8 +16,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from controlmm.generation.clip_groups import Lengths
 from controlmm.generation.convolution_taps import Taps
-from controlmm.generation.frozen_layers import FrozenConv, Lengths
+from controlmm.generation.frozen_layers import FrozenConv
 from controlmm.generation.repeated_ends import RepeatedEnds, repeated_ends
 from controlmm.nn.conv import ConvDecoder, ResidualConvBlock, ResidualStack
 
@@ -50,8 +51,8 @@ class Tape:
 
 
 class _Block:
-    def __init__(self, block: ResidualConvBlock, dtype: torch.dtype) -> None:
-        self.dilated = FrozenConv.of(block.dilated, dtype)
+    def __init__(self, block: ResidualConvBlock, dtype: torch.dtype, *, is_long: bool) -> None:
+        self.dilated = FrozenConv.of(block.dilated, dtype, is_long=is_long)
         self.pointwise = FrozenConv.of(block.pointwise, dtype)
 
 
@@ -68,8 +69,11 @@ class FrozenDecoder:
         self._repeats_ends, self._step = decoder.ends == "repeat", decoder.downsample
         self._entry = FrozenConv.of(decoder.entry, dtype)
         self._stacks = [
-            [_Block(cast(ResidualConvBlock, block), dtype) for block in cast(ResidualStack, stack)]
-            for stack in decoder.stacks
+            [
+                _Block(cast(ResidualConvBlock, block), dtype, is_long=doublings > 0)
+                for block in cast(ResidualStack, stack)
+            ]
+            for doublings, stack in enumerate(decoder.stacks)
         ]
         ups = [Taps.of(cast(nn.Conv1d, up)) for up in decoder.up]
         self._smooth: FrozenConv | None = None
@@ -78,8 +82,11 @@ class FrozenDecoder:
             # clip's ends, and frames there are cut off.
             ups[-1] = ups[-1].then(Taps.of(decoder.smooth))
         else:
-            self._smooth = FrozenConv.of(decoder.smooth, dtype)
-        self._ups = [FrozenConv.of_taps(up.of_doubled_frames(), dtype) for up in ups]
+            self._smooth = FrozenConv.of(decoder.smooth, dtype, is_long=True)
+        self._ups = [
+            FrozenConv.of_taps(up.of_doubled_frames(), dtype, is_long=doublings > 0)
+            for doublings, up in enumerate(ups)
+        ]
         self._exit = decoder.exit
         self._exits: dict[tuple[int, ...], FrozenConv] = {}
 

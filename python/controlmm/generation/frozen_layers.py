@@ -9,38 +9,59 @@ from __future__ import annotations
 import math
 import threading
 from functools import lru_cache
+from typing import Protocol
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from controlmm.generation.clip_groups import Lengths
 from controlmm.generation.convolution_taps import Taps
-from controlmm.generation.frozen_matrix import Activation, FrozenMatrix
-
-Lengths = tuple[int, ...]  # of clips that lie end to end
+from controlmm.generation.frozen_matrix import FrozenMatrix
+from controlmm.generation.winograd_layer import WinogradLayer
+from controlmm.ops import available_isas
 
 
 class FrozenConv:
-    """A convolution of width 1 or 3 over time that keeps the number of frames; (B, T, C) tensors."""
+    """A convolution of width 1 or 3 over time that keeps the number of frames; (B, T, C) tensors.
+
+    Args:
+        weight: The filters.
+        bias: Of each output.
+        dilation: Frames between a filter's taps.
+        dtype: Of the arithmetic.
+        is_long: Whether clips have many frames here, so that a way with fewer and smaller products pays.
+    """
 
     def __init__(
-        self, weight: Float[Tensor, "out in k"], bias: Float[Tensor, "out"], dilation: int, dtype: torch.dtype
+        self,
+        weight: Float[Tensor, "out in k"],
+        bias: Float[Tensor, "out"],
+        dilation: int,
+        dtype: torch.dtype,
+        *,
+        is_long: bool = False,
     ) -> None:
-        weight = weight.detach()
-        self._dilation, self._taps = dilation, weight.shape[-1]
-        self._forward = FrozenMatrix(weight.permute(0, 2, 1).flatten(1), bias, dtype)
-        self._backward = FrozenMatrix(weight.flip(-1).permute(1, 2, 0).flatten(1), None, dtype)
+        weight, turned = weight.detach(), weight.detach().flip(-1).transpose(0, 1)
+        self._forward: _Layer
+        self._backward: _Layer
+        if is_long and weight.shape[-1] == 3 and dtype == torch.float32 and available_isas():
+            self._forward = WinogradLayer(weight, bias, dilation)
+            self._backward = WinogradLayer(turned, None, dilation)
+        else:
+            self._forward = _DirectLayer(weight, bias, dilation, dtype)
+            self._backward = _DirectLayer(turned, None, dilation, dtype)
 
     @classmethod
-    def of(cls, conv: nn.Conv1d, dtype: torch.dtype) -> FrozenConv:
+    def of(cls, conv: nn.Conv1d, dtype: torch.dtype, *, is_long: bool = False) -> FrozenConv:
         """A frozen copy of ``conv``."""
         assert conv.bias is not None  # the decoder's convolutions all have one
-        return cls(conv.weight, conv.bias.detach(), conv.dilation[0], dtype)
+        return cls(conv.weight, conv.bias.detach(), conv.dilation[0], dtype, is_long=is_long)
 
     @classmethod
-    def of_taps(cls, taps: Taps, dtype: torch.dtype) -> FrozenConv:
+    def of_taps(cls, taps: Taps, dtype: torch.dtype, *, is_long: bool = False) -> FrozenConv:
         """One with these weights, frame by frame."""
-        return cls(taps.weight, taps.bias, 1, dtype)
+        return cls(taps.weight, taps.bias, 1, dtype, is_long=is_long)
 
     def forward(
         self,
@@ -54,16 +75,28 @@ class FrozenConv:
 
         Of one row, ``lengths`` are the frames of the clips that lie in it end to end.
         """
-        activation: Activation = "relu" if is_rectified else "none"
-        product = self._forward(self._rows(x, lengths), activation=activation, is_tangent=is_tangent)
-        return product.view(*x.shape[:2], -1)
+        return self._forward(x, lengths, is_rectified=is_rectified, is_tangent=is_tangent)
 
     def backward(self, gradient: Float[Tensor, "B T D"], lengths: Lengths = ()) -> Float[Tensor, "B T C"]:
         """The gradient in the input, given that in the output."""
-        return self._backward(self._rows(gradient, lengths)).view(*gradient.shape[:2], -1)
+        return self._backward(gradient, lengths, is_rectified=False, is_tangent=True)
 
-    def _rows(self, x: Float[Tensor, "B T C"], lengths: Lengths) -> Float[Tensor, "N taps"]:
-        return x.flatten(0, 1) if self._taps == 1 else neighbours(x, self._dilation, lengths).flatten(0, 1)
+
+class _Layer(Protocol):
+    def __call__(self, x: Tensor, lengths: Lengths, *, is_rectified: bool, is_tangent: bool) -> Tensor: ...
+
+
+class _DirectLayer:
+    """One product with every frame beside its neighbours."""
+
+    def __init__(self, weight: Tensor, bias: Tensor | None, dilation: int, dtype: torch.dtype) -> None:
+        self._dilation, self._taps = dilation, weight.shape[-1]
+        self._matrix = FrozenMatrix(weight.permute(0, 2, 1).flatten(1), bias, dtype)
+
+    def __call__(self, x: Tensor, lengths: Lengths, *, is_rectified: bool, is_tangent: bool) -> Tensor:
+        rows = (x if self._taps == 1 else neighbours(x, self._dilation, lengths)).flatten(0, 1)
+        product = self._matrix(rows, activation="relu" if is_rectified else "none", is_tangent=is_tangent)
+        return product.view(*x.shape[:2], -1)
 
 
 def neighbours(x: Float[Tensor, "B T C"], distance: int, lengths: Lengths = ()) -> Float[Tensor, "B T 3C"]:

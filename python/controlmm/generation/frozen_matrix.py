@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from controlmm.generation.one_thread import one_thread
-from controlmm.nn.row_product import row_product
+from controlmm.nn.row_product import row_product, row_products
 
 Activation = Literal["none", "relu", "gelu"]
 
@@ -60,6 +60,25 @@ class FrozenMatrix:
         for part, columns in zip(inputs[1:], others, strict=True):
             total += columns.product(part, None)
         return _activated(total, activation).to(x.dtype)
+
+
+class FrozenMatrices:
+    """``x -> x W^T`` with several ``W`` of one shape, each for its part of ``x``; float32."""
+
+    def __init__(self, weights: Float[Tensor, "P out in"]) -> None:
+        weights = weights.detach().float()
+        self._transposed: Tensor | None = None
+        self._each: list[FrozenMatrix] = []
+        if plain_products_are_best(*weights.shape[1:]):
+            self._transposed = weights.mT.contiguous()
+        else:
+            self._each = [FrozenMatrix(weight, None, torch.float32) for weight in weights]
+
+    def __call__(self, x: Float[Tensor, "P N in"]) -> Float[Tensor, "P N out"]:
+        """The products."""
+        if self._transposed is not None:
+            return row_products(x, self._transposed)
+        return torch.stack([matrix(part) for matrix, part in zip(self._each, x, strict=True)])
 
 
 class _Columns:

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from controlmm.generation.frozen_layers import Lengths
+from controlmm.generation.clip_groups import Lengths
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,6 +27,8 @@ from controlmm.ops.obstacles import (
     pack_obstacles,
 )
 from controlmm.ops.signed_distance import signed_distances
+from controlmm.ops.winograd import winograd_frames, winograd_parts, winograd_weights
+from controlmm.ops.winograd_tiles import WinogradTiles
 
 __all__ = [
     "Backend",
@@ -39,6 +41,7 @@ __all__ = [
     "PackedObstacles",
     "Plane",
     "Sphere",
+    "WinogradTiles",
     "active_isa",
     "available_isas",
     "build_info",
@@ -56,4 +59,7 @@ __all__ = [
     "smooth_bones",
     "use_backend",
     "use_isa",
+    "winograd_frames",
+    "winograd_parts",
+    "winograd_weights",
 ]
