@@ -16,6 +16,7 @@ from typing import Any
 import torch
 
 from benchmarks import cases
+from benchmarks.convolution_cases import FRAMES, convolutions
 from benchmarks.exact_cases import exact
 from benchmarks.timing import copy_bandwidth, interleaved
 from controlmm import _core, ops
@@ -95,6 +96,10 @@ def _all_rows(*, is_quick: bool, rounds: int, bandwidths: dict[int, float]) -> I
         for tokens in (49, 1568):
             where = {"batch": tokens // 49, "frames": 196, "threads": threads}
             for workload in cases.gumbel(tokens, threads):
+                yield _measured(workload, rounds=rounds, is_cold=False, bandwidth=bandwidth, **where)
+        for batch in (1, 8, 32):
+            where = {"batch": batch, "frames": FRAMES, "threads": threads}
+            for workload in convolutions(batch):
                 yield _measured(workload, rounds=rounds, is_cold=False, bandwidth=bandwidth, **where)
         for workload in exact(196):
             where = {"batch": 1, "frames": 196, "threads": threads}
