@@ -40,10 +40,10 @@ void winograd_parts(const TensorView& x, const TensorView& rows, const TensorVie
     using T = decltype(zero);
     checks::require(x, "x", 2, x.dtype);
     checks::require_contiguous(x, "x");
+    const std::int64_t* frames = checked_rows(rows, 6, x.shape[0]);
     checks::require(parts, "parts", 3, x.dtype);
     checks::require_shape(parts, "parts", {6, rows.shape[0], x.shape[1]});
     checks::require_row_major(parts, "parts");
-    const std::int64_t* frames = checked_rows(rows, 6, x.shape[0]);
     if (parts.size() == 0) return;
     const std::vector<T> zeros(static_cast<std::size_t>(x.shape[1]));
     active_kernels().of<T>().winograd_parts(
@@ -58,9 +58,9 @@ void winograd_frames(const TensorView& products, const TensorView& rows, const T
     checks::require(y, "y", 2, y.dtype);
     checks::require_row_major(y, "y");
     WinogradFramesArgs<T> args{};
+    args.rows = checked_rows(rows, 4, y.shape[0]);
     args.tiles = rows.shape[0];
     args.channels = y.shape[1];
-    args.rows = checked_rows(rows, 4, y.shape[0]);
     require_every_frame_once(args.rows, rows.size(), y.shape[0]);
     checks::require(products, "products", 3, y.dtype);
     checks::require_shape(products, "products", {6, args.tiles, args.channels});

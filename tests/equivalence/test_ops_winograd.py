@@ -178,5 +178,6 @@ def test_tensors_that_do_not_fit_are_refused(backend):
     for wrong in (bias[:4], bias.double(), bias[None]):
         with pytest.raises(ValueError, match=r"`bias` must be torch\.float32 of shape \(5,\)"):
             ops.winograd_frames(products, TILES, wrong, backend=backend)
-    with pytest.raises(ValueError, match=r"`weight` must have shape \(D, C, 3\), got \(5, 3, 2\)"):
-        ops.winograd_weights(torch.zeros(5, 3, 2))
+    for wrong in (torch.zeros(5, 3, 2), torch.zeros(5, 3), torch.zeros(5, 3, 3).long()):
+        with pytest.raises(ValueError, match=r"`weight` must be floating-point of shape \(D, C, 3\), got"):
+            ops.winograd_weights(wrong)

@@ -77,6 +77,10 @@ def test_public_operators_answer_or_refuse_anything(a, b, c, joints, parents, st
         lambda: ops.obstacle_loss(a, [ops.Sphere((0, 0, 0), 1.0)], lengths=b),
         lambda: ops.gumbel_straight_through(a, b, seed=0),
         lambda: ops.guidance_value_and_grad(a, b, c, mean=a, std=b),
+        lambda: ops.winograd_weights(a),
+        lambda: ops.winograd_parts(a, ops.WinogradTiles(b, c, joints)),
+        lambda: ops.winograd_parts(a, ops.WinogradTiles.of(parents, steps)),
+        lambda: ops.winograd_frames(a, ops.WinogradTiles.of((5, 2), 1), b),
     ]
     for call in calls:
         try:
@@ -112,6 +116,8 @@ ARGUMENTS = {
     "softmax_backward": (2, lambda t: (t[0], 1.0, t[1], 1)),
     "project_change": (4, lambda t: (*t[:3], 10.0, 100.0, 1e4, t[3])),
     "smooth_bones": (8, lambda t: (*t[:7], 10.0, 1e3, 100.0, 1e4, 1e5, 3e3, 1e3, 1e-3, 2, t[7])),
+    "winograd_parts": (3, lambda t: t),
+    "winograd_frames": (4, lambda t: (*t[:3], True, t[3])),
     "frame_bones": (6, lambda t: (*t[:5], 10.0, 1e3, 1e4, 1e-9, 1e-3, 0.05, 2, t[5])),
 }
 

@@ -36,10 +36,11 @@ def winograd_weights(weight: Float[Tensor, "D C 3"]) -> Float[Tensor, "6 D C"]:
     """The matrices of the six products, made in float64 and given in the weights' type.
 
     Raises:
-        ValueError: If the filters are not three taps wide.
+        ValueError: If the filters are not three taps wide, or not floating-point.
     """
-    if weight.ndim != 3 or weight.shape[2] != 3:
-        raise ValueError(f"`weight` must have shape (D, C, 3), got {tuple(weight.shape)}.")
+    if weight.ndim != 3 or weight.shape[2] != 3 or not weight.is_floating_point():
+        came = f"{weight.dtype} of {tuple(weight.shape)}"
+        raise ValueError(f"`weight` must be floating-point of shape (D, C, 3), got {came}.")
     factors = torch.tensor(_OF_WEIGHTS, dtype=torch.float64, device=weight.device)
     return torch.einsum("pk,dck->pdc", factors, weight.double()).to(weight.dtype)
 
@@ -64,7 +65,7 @@ def winograd_parts(
     if not runs_native(backend, x):
         return winograd_parts_reference(x, tiles)
     parts = x.new_empty(PRODUCTS, len(tiles), x.shape[1])
-    core().winograd_parts(x.contiguous(), tiles.taken, parts)
+    core().winograd_parts(x.contiguous(), tiles.taken.contiguous(), parts)
     return parts
 
 
@@ -101,5 +102,5 @@ def winograd_frames(
         return winograd_frames_reference(products, tiles, bias, is_rectified=is_rectified)
     y = products.new_empty(tiles.frames, products.shape[2])
     bias = products.new_zeros(0) if bias is None else bias.detach().contiguous()
-    core().winograd_frames(products.contiguous(), tiles.made, bias, is_rectified, y)
+    core().winograd_frames(products.contiguous(), tiles.made.contiguous(), bias, is_rectified, y)
     return y
