@@ -10,7 +10,7 @@ from controlmm import ops
 
 # A sum of six terms with factors up to 8, and what single terms of order one can leave of it.
 TOLERANCE = {torch.float32: 2e-5, torch.float64: 1e-13}
-# Of a convolution with weights of unit gain: float32 errs by 5e-7 on average, and by 13 times that at most.
+# Of a convolution of unit gain: with 192 channels float32 errs by 5e-7 on average, by 6e-6 at most.
 CONVOLUTION = {torch.float32: 2e-5, torch.float64: 1e-13}
 
 

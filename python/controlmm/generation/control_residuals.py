@@ -88,11 +88,9 @@ class ControlResiduals:
         self.led = tuple(joints or controlled_joints(mask))
         self.channels = tuple(_channels_of(self.led))
         self.part = PartialDecoder(decoder, range(mask.shape[2]), frames)
-        wanted = list(self.part.joints)
-        self._wanted, controlled = targets[:, :, wanted], mask[:, :, wanted]
         self._views = [
-            _View.of(clip[:length], self.part.joints, self.led)
-            for clip, length in zip(controlled, frames.sum(1).tolist(), strict=True)
+            _View.of(clip[:length], self.led)
+            for clip, length in zip(mask, frames.sum(1).tolist(), strict=True)
         ]
         self._prefix = prefix
         self._held: Tensor | None = None
@@ -128,7 +126,7 @@ class ControlResiduals:
         if self.naturalness is not None:
             self._strains = self.naturalness.values(features, self._joints)
             strains = self._strains.tolist()
-        difference = self._joints.detach() - self._wanted
+        difference = self._joints.detach() - self._targets
         return [
             self._probe(clip, features.detach(), difference, strains[clip]) for clip in range(len(latents))
         ]
@@ -202,8 +200,8 @@ class _View:
 
     Attributes:
         coordinates: Where the controlled ones are in the clip's flattened joints.
-        joints: Which of the decoded joints.
-        channels: Which of the decoded channels.
+        joints: Which joints; all are decoded.
+        channels: Their channels.
         columns: Which they are of those that the residuals' metric knows.
         mask: (T, J, 3) the controlled coordinates of these joints.
     """
@@ -215,17 +213,15 @@ class _View:
     mask: Bool[Tensor, "T J 3"]
 
     @classmethod
-    def of(cls, controlled: Bool[Tensor, "T J 3"], decoded: Sequence[int], led: Sequence[int]) -> _View:
-        """Of a clip's mask for the joints that are ``decoded``."""
-        places = controlled_joints(controlled[None])
-        own = [decoded[place] for place in places]
-        columns = _channels_of([led.index(joint) for joint in own])
+    def of(cls, mask: Bool[Tensor, "T J 3"], led: Sequence[int]) -> _View:
+        """Of a clip's own frames, for a metric that knows the joints that are ``led``."""
+        own = controlled_joints(mask[None])
         return cls(
-            controlled.flatten().nonzero()[:, 0],
-            torch.tensor(places),
-            torch.tensor(_channels_of(places)),
-            torch.tensor(columns),
-            controlled[:, list(places)],
+            mask.flatten().nonzero()[:, 0],
+            torch.tensor(own),
+            torch.tensor(_channels_of(own)),
+            torch.tensor(_channels_of([led.index(joint) for joint in own])),
+            mask[:, list(own)],
         )
 
 
