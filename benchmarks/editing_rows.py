@@ -172,7 +172,7 @@ def _solved(objective: ControlObjective, latents: Tensor, budget: EditingBudget)
     if budget.solver == "auto":  # made once in a process for a choice of joints: it does not count
         residuals = objective.residuals()
         assert residuals is not None  # squares of a residual tokenizer
-        residuals.gram(residuals.probe(torch.zeros_like(latents))[0], None)
+        residuals.gram(residuals.probe(torch.zeros_like(latents))[0])
     began = time.thread_time()
     solution = edit_latents(objective, latents, torch.ones(1, latents.shape[1], 1), budget)
     return solution.latents, time.thread_time() - began, int(solution.evaluations[0])

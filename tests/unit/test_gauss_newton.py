@@ -9,7 +9,7 @@ from controlmm.generation.code_spread import CodeSpread
 from controlmm.generation.control_residuals import ControlResiduals
 from controlmm.generation.frozen_decoder import FrozenDecoder
 from controlmm.generation.frozen_layers import neighbours
-from controlmm.generation.kinematic_rows import kinematic_rows
+from controlmm.generation.kinematic_rows import KinematicPattern
 from controlmm.generation.objective import ControlObjective
 from controlmm.generation.partial_decoder import PartialDecoder, controlled_joints
 from controlmm.generation.sensitivity import measure_sensitivity
@@ -196,8 +196,9 @@ def test_the_step_is_the_least_norm_solution():
     mask = torch.zeros(20, 3, 3, dtype=torch.bool)
     mask[7], mask[15, 0], mask[18, 2] = True, True, True
     scaled = features[0].double() * std
-    rows = kinematic_rows(scaled, recover_joints(scaled[None], joints=3)[0], mask, std)
-    whole = torch.cat([rows.root.flatten(1), rows.local.to_dense()], dim=1) @ jacobian
+    joints = recover_joints(scaled[None], joints=3)[0]
+    rows = KinematicPattern(mask, std).rows(scaled, joints)
+    whole = rows.dense(10).mT.flatten(1) @ jacobian
     residual = random(int(mask.sum()), seed=6).double()
     metric = Metric(
         rows.gram((jacobian @ jacobian.T).reshape(10, 20, 10, 20), torch.arange(10)), damping=1e-12

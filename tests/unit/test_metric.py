@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from controlmm.generation.coordinate_groups import Groups
-from controlmm.generation.kinematic_rows import kinematic_rows
+from controlmm.generation.kinematic_rows import KinematicPattern, KinematicRows
 from controlmm.generation.solvers.metric import Metric
 from controlmm.ops import recover_joints
 
@@ -15,6 +15,10 @@ ALL = torch.arange(10)
 
 def random(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def rows_of(features, joints, mask, std, groups=None) -> KinematicRows:
+    return KinematicPattern(mask, std, groups).rows(features, joints)
 
 
 @pytest.fixture
@@ -34,8 +38,8 @@ def rows_case():
 
 def test_kinematic_rows_are_the_jacobian_of_the_kinematics(rows_case):
     case, jacobian = rows_case
-    rows = kinematic_rows(*case)
-    dense = torch.cat([rows.root.flatten(1), rows.local.to_dense()], dim=1)
+    rows = rows_of(*case)
+    dense = rows.dense(10).mT.flatten(1)
     torch.testing.assert_close(dense, jacobian, rtol=1e-12, atol=1e-12)
 
 
@@ -44,10 +48,10 @@ def test_products_of_kinematic_rows_and_of_their_sums(rows_case):
     half = random(200, 200, seed=5).double()
     channels = (half @ half.T).reshape(10, 20, 10, 20)
     expected = jacobian @ half @ half.T @ jacobian.T
-    torch.testing.assert_close(kinematic_rows(*case).gram(channels, ALL), expected, rtol=1e-10, atol=1e-8)
+    torch.testing.assert_close(rows_of(*case).gram(channels, ALL), expected, rtol=1e-10, atol=1e-8)
     groups = Groups.of_neighbours(case[2], 3)
     sums = torch.stack([groups.sum(unit) for unit in torch.eye(len(expected)).double()], dim=1)
-    summed = kinematic_rows(*case, groups).gram(channels, ALL)
+    summed = rows_of(*case, groups).gram(channels, ALL)
     torch.testing.assert_close(summed, sums @ expected @ sums.T, rtol=1e-10, atol=1e-8)
     torch.testing.assert_close(
         groups.spread(torch.arange(len(sums)).double()), sums.T @ torch.arange(len(sums)).double()
@@ -60,7 +64,7 @@ def test_products_among_those_of_more_channels_and_frames(rows_case):
     half = random(16 * 24, 50, seed=5).double()
     products, columns = (half @ half.T).reshape(16, 24, 16, 24), torch.tensor([0, 1, 2, 3, 7, 8, 9, 4, 5, 6])
     own = products[:, :20, :, :20][columns][:, :, columns].contiguous()
-    rows = kinematic_rows(*case)
+    rows = rows_of(*case)
     torch.testing.assert_close(rows.gram(products, columns), rows.gram(own, ALL), rtol=1e-10, atol=1e-8)
 
 
@@ -98,7 +102,7 @@ def test_a_metric_of_groups_is_a_metric(rows_case):
     half = random(200, 200, seed=5).double()
     groups = Groups.of_many(case[2], 20)
     products = (half @ half.T).reshape(10, 20, 10, 20)
-    metric = Metric(kinematic_rows(*case, groups).gram(products, ALL), groups)
+    metric = Metric(rows_of(*case, groups).gram(products, ALL), groups)
     size = int(case[2].sum())
     matrix = torch.stack([metric.weigh(unit)[1] for unit in torch.eye(size).double()])
     assert size > 40

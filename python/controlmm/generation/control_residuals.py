@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -11,7 +13,7 @@ from torch import Tensor
 
 from controlmm.generation.code_spread import CodeSpread
 from controlmm.generation.coordinate_groups import Groups
-from controlmm.generation.kinematic_rows import KinematicRows, kinematic_rows
+from controlmm.generation.kinematic_rows import KinematicPattern, KinematicRows
 from controlmm.generation.motion_decoder import MotionDecoder
 from controlmm.generation.naturalness import Naturalness
 from controlmm.generation.one_thread import one_thread
@@ -25,12 +27,9 @@ class Probe:
 
     Attributes:
         residual: (N,) controlled coordinates minus their targets, metres, float64.
-        features: (T, D) de-normalised channels of the pelvis and of the joints that the clip controls, on
-            its own frames.
+        features: (T, D) de-normalised channels of all joints, on its own frames; the root's come first.
         joints: (T, J, 3) what they decode to, metres.
-        mask: (T, J, 3) the controlled coordinates.
-        std: (D,) of the channels.
-        columns: (D,) which they are of those that the residuals' metric knows.
+        view: What the metric looks at of them.
         metres: Length of one unit of the joints.
         strain: Terms of naturalness, see :class:`Naturalness`.
     """
@@ -38,21 +37,23 @@ class Probe:
     residual: Float[Tensor, "N"]
     features: Float[Tensor, "T D"]
     joints: Float[Tensor, "T J 3"]
-    mask: Bool[Tensor, "T J 3"]
-    std: Float[Tensor, "D"]
-    columns: Int[Tensor, "D"]
+    view: ClipView
     metres: float
     strain: float
 
-    @property
+    @cached_property
     @one_thread()
     def loss(self) -> float:
         """Mean squared error, as of :class:`ControlObjective`."""
         return self.residual.square().mean().item() if len(self.residual) else 0.0
 
-    def rows(self, groups: Groups | None) -> KinematicRows:
-        """How the residual, or sums of its coordinates, answer to the channels, here."""
-        return kinematic_rows(self.features, self.joints, self.mask, self.std, groups)
+    @property
+    def rows(self) -> KinematicRows:
+        """How the residual, or the groups' sums of its coordinates, answer to the view's channels, here."""
+        view = self.view
+        return view.pattern.rows(
+            self.features.index_select(1, view.channels), self.joints.index_select(1, view.joints)
+        )
 
 
 class ControlResiduals:
@@ -63,8 +64,6 @@ class ControlResiduals:
         targets: (B, T, J, 3) metres.
         mask: (B, T, J, 3), the controlled coordinates.
         frames: (B, T), the frames of each clip.
-        joints: Which joints the metric knows; by default those that some clip controls. All are decoded:
-            sums over fewer joints add up in another order, and clips would depend on their company.
         prefix: Latents of motions whose first ``prefix_frames`` frames are kept whatever is tried: features
             there count as constant, although tokens behind them would change them a little.
         prefix_frames: See ``prefix``.
@@ -78,37 +77,33 @@ class ControlResiduals:
         mask: Bool[Tensor, "B T J 3"],
         frames: Bool[Tensor, "B T"],
         *,
-        joints: Sequence[int] | None = None,
         prefix: Float[Tensor, "B L C"] | None = None,
         prefix_frames: int = 0,
         naturalness: Naturalness | None = None,
     ) -> None:
-        self.decoder, self._targets, self._mask, self._frames = decoder, targets, mask, frames
-        self.naturalness = naturalness
-        self.led = tuple(joints or controlled_joints(mask))
-        self.channels = tuple(_channels_of(self.led))
+        self.decoder, self._targets, self.naturalness = decoder, targets, naturalness
+        # The metric knows joints that some clip controls. All are decoded: sums over fewer joints add up in
+        # another order, and clips would depend on their company.
+        led = controlled_joints(mask)
+        self.channels = tuple(_channels_of(led))
+        self._average: dict[int, Tensor] = {}  # products of the decoder's rows, for so many tokens
         self.part = PartialDecoder(decoder, range(mask.shape[2]), frames)
         self._views = [
-            _View.of(clip[:length], self.led)
+            ClipView.of(clip[:length], led, self.part.std)
             for clip, length in zip(mask, frames.sum(1).tolist(), strict=True)
         ]
-        self._prefix = prefix
         self._held: Tensor | None = None
         if prefix is not None:
             self._held = self.part.decode(prefix).features[:, :prefix_frames]
 
     def select(self, clips: Int[Tensor, "S"]) -> ControlResiduals:
-        """The same for some of the clips."""
-        return ControlResiduals(
-            self.decoder,
-            self._targets[clips],
-            self._mask[clips],
-            self._frames[clips],
-            joints=self.led,
-            prefix=None if self._prefix is None else self._prefix[clips],
-            prefix_frames=0 if self._held is None else self._held.shape[1],
-            naturalness=None if self.naturalness is None else self.naturalness.select(clips),
-        )
+        """The same for some of the clips; what is known of them stays so."""
+        some = copy(self)
+        some._targets, some.part = self._targets[clips], self.part.select(clips)
+        some._views = [self._views[clip] for clip in clips.tolist()]
+        some._held = None if self._held is None else self._held[clips]
+        some.naturalness = None if self.naturalness is None else self.naturalness.select(clips)
+        return some
 
     @torch.enable_grad()
     def probe(self, latents: Float[Tensor, "B L C"]) -> list[Probe]:
@@ -126,25 +121,21 @@ class ControlResiduals:
         if self.naturalness is not None:
             self._strains = self.naturalness.values(features, self._joints)
             strains = self._strains.tolist()
-        difference = self._joints.detach() - self._targets
+        joints, features = self._joints.detach(), features.detach()
+        difference, metres = joints - self._targets, self.decoder.normalizer.skeleton.metres
         return [
-            self._probe(clip, features.detach(), difference, strains[clip]) for clip in range(len(latents))
+            Probe(
+                apart.flatten()[view.coordinates].double(),
+                own_features[: len(view.mask)],
+                own_joints[: len(view.mask)],
+                view,
+                metres,
+                strain,
+            )
+            for apart, own_features, own_joints, view, strain in zip(
+                difference, features, joints, self._views, strains, strict=True
+            )
         ]
-
-    def _probe(self, clip: int, features: Tensor, difference: Tensor, strain: float) -> Probe:
-        """One clip's part; the metric looks at joints that it controls only."""
-        view = self._views[clip]
-        length = len(view.mask)
-        return Probe(
-            difference[clip].flatten()[view.coordinates].double(),
-            features[clip, :length].index_select(1, view.channels),
-            self._joints.detach()[clip, :length].index_select(1, view.joints),
-            view.mask,
-            self.part.std[view.channels],
-            view.columns,
-            self.decoder.normalizer.skeleton.metres,
-            strain,
-        )
 
     @property
     def coordinates(self) -> list[int]:
@@ -156,13 +147,15 @@ class ControlResiduals:
         """The unit of the latents' steps."""
         return self.decoder.spread()
 
-    def gram(self, probe: Probe, groups: Groups | None) -> Float[Tensor, "M M"]:
-        """Products of the Jacobian's rows for the residual, or sums of its coordinates, of a clip.
+    def gram(self, probe: Probe) -> Float[Tensor, "M M"]:
+        """Products of the Jacobian's rows for a clip's residual, or for the sums that its view asks for.
 
         The decoder's part is that of an average clip.
         """
         tokens = len(probe.features) // self.decoder.downsample
-        return probe.rows(groups).gram(self.decoder.channel_gram(self.channels, tokens), probe.columns)
+        if tokens not in self._average:
+            self._average[tokens] = self.decoder.channel_gram(self.channels, tokens)
+        return probe.rows.gram(self._average[tokens], probe.view.columns)
 
     def pull(
         self, weights: Sequence[Float[Tensor, "N"] | None], *, strained: Sequence[bool] = ()
@@ -188,14 +181,16 @@ class ControlResiduals:
 
     def jacobian(self, clip: int, probe: Probe) -> Float[Tensor, "N L C"]:
         """Gradients of each of a clip's residuals at the latest probe, of which ``probe`` is its part."""
-        rows = probe.rows(None).dense().float()
+        view = probe.view
+        assert view.groups is None  # of so many coordinates nobody asks for single rows
+        rows = probe.rows.dense(len(view.channels)).float()
         if self._held is not None:
             rows[:, : self._held.shape[1]] = 0
-        return self.part.pull_rows(self._decoded, clip, rows, [self.channels[i] for i in probe.columns])
+        return self.part.pull_rows(self._decoded, clip, rows, [self.channels[i] for i in view.columns])
 
 
 @dataclass(frozen=True, eq=False)
-class _View:
+class ClipView:
     """What the metric looks at of a clip: the joints that it controls.
 
     Attributes:
@@ -204,6 +199,7 @@ class _View:
         channels: Their channels.
         columns: Which they are of those that the residuals' metric knows.
         mask: (T, J, 3) the controlled coordinates of these joints.
+        std: Of the channels.
     """
 
     coordinates: Int[Tensor, "N"]
@@ -211,18 +207,31 @@ class _View:
     channels: Int[Tensor, "D"]
     columns: Int[Tensor, "D"]
     mask: Bool[Tensor, "T J 3"]
+    std: Float[Tensor, "D"]
 
     @classmethod
-    def of(cls, mask: Bool[Tensor, "T J 3"], led: Sequence[int]) -> _View:
-        """Of a clip's own frames, for a metric that knows the joints that are ``led``."""
+    def of(cls, mask: Bool[Tensor, "T J 3"], led: Sequence[int], std: Float[Tensor, "C"]) -> ClipView:
+        """Of a clip's own frames, for a metric that knows joints that are ``led``; ``std`` is of all channels."""
         own = controlled_joints(mask[None])
+        channels = torch.tensor(_channels_of(own))
         return cls(
             mask.flatten().nonzero()[:, 0],
             torch.tensor(own),
-            torch.tensor(_channels_of(own)),
+            channels,
             torch.tensor(_channels_of([led.index(joint) for joint in own])),
             mask[:, list(own)],
+            std[channels],
         )
+
+    @cached_property
+    def groups(self) -> Groups | None:
+        """Sums of coordinates that the metric knows instead, where there are many."""
+        return Groups.of_many(self.mask)
+
+    @cached_property
+    def pattern(self) -> KinematicPattern:
+        """Of the Jacobian's rows."""
+        return KinematicPattern(self.mask, self.std, self.groups)
 
 
 def _channels_of(joints: Sequence[int]) -> list[int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -53,6 +54,10 @@ class Groups:
         return cls(index, counts[index].double().rsqrt())
 
     def __len__(self) -> int:
+        return self._count
+
+    @cached_property
+    def _count(self) -> int:
         return int(self.index.max()) + 1 if len(self.index) else 0
 
     def sum(self, values: Float[Tensor, "N"]) -> Float[Tensor, "M"]:

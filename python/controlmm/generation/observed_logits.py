@@ -14,7 +14,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from controlmm.generation.control_residuals import ControlResiduals, Probe
-from controlmm.generation.coordinate_groups import Groups
 from controlmm.generation.one_thread import one_thread
 from controlmm.generation.solvers.metric import Metric
 from controlmm.generation.token_mixture import token_mixture
@@ -49,5 +48,4 @@ def _force(residuals: ControlResiduals, probe: Probe) -> Float[Tensor, "N"] | No
     """On each coordinate of a clip: ``(J J^T + error)^-1 r``; ``None`` near the targets."""
     if probe.metres * (3 * probe.loss) ** 0.5 < _NEAR:
         return None
-    groups = Groups.of_many(probe.mask)
-    return Metric(residuals.gram(probe, groups), groups).weigh(probe.residual)[1]
+    return Metric(residuals.gram(probe), probe.view.groups).weigh(probe.residual)[1]

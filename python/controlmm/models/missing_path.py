@@ -30,10 +30,14 @@ def missing_in_heading(
         metres: Length of the skeleton's unit.
         fps: Frames a second.
     """
-    missing = torch.where(mask, targets - current, 0.0) * metres
-    speed = slopes(missing, mask) * fps
+    led = mask.transpose(2, 0).flatten(1).any(1).nonzero()[:, 0]  # most joints have no target in any clip
+    own_mask, own_targets, own = (x.index_select(2, led) for x in (mask, targets, current))
+    missing = torch.where(own_mask, own_targets - own, 0.0) * metres
+    speed = slopes(missing, own_mask) * fps
     yaw = -heading(current, skeleton_of_joints(current.shape[2]))[:, :, None]
-    return turned(missing, yaw), turned(speed, yaw)
+    nothing = torch.zeros_like(current)
+    missing, speed = (nothing.index_copy(2, led, turned(way, yaw)) for way in (missing, speed))
+    return missing, speed
 
 
 def slopes(values: Float[Tensor, "B T J 3"], mask: Bool[Tensor, "B T J 3"]) -> Float[Tensor, "B T J 3"]:

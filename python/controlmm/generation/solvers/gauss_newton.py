@@ -17,7 +17,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from controlmm.generation.control_residuals import ControlResiduals, Probe
-from controlmm.generation.coordinate_groups import Groups
 from controlmm.generation.joint_progress import Progress
 from controlmm.generation.one_thread import one_thread
 from controlmm.generation.solvers.clip_search import ClipRecord, report, solution_of
@@ -230,8 +229,7 @@ class _Descent:
     def _renew(self, probe: Probe) -> None:
         """The metric of the clip as it now is; gradients of the old one cannot be compared with new ones."""
         self._way = _way(probe)
-        groups = Groups.of_many(probe.mask)
-        self._metric = Metric(self._residuals.gram(probe, groups), groups)
+        self._metric = Metric(self._residuals.gram(probe), probe.view.groups)
         self._memory.clear()
         self._gradient = None
 
