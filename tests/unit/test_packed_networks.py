@@ -9,7 +9,6 @@ import torch
 from torch import nn
 
 from controlmm.generation import frozen_matrix
-from controlmm.generation.clip_groups import clips_by_length
 from controlmm.generation.frozen_matrix import FrozenMatrix, has_fast_bfloat16
 from controlmm.generation.noise import clip_seeds
 from controlmm.generation.packed_networks import PackedCopies, PackedLinear, packed_copy
@@ -241,11 +240,3 @@ def test_only_our_presets_and_models_multiply_in_bfloat16(tiny_pipeline, monkeyp
     published = replace(tiny_pipeline.control.config, has_observation_mask=False)
     monkeypatch.setattr(tiny_pipeline.control, "config", published)
     assert tiny_pipeline.drawing_dtype(PRESETS["accurate"]) == torch.float32
-
-
-def test_groups_hold_every_clip_once_with_others_of_its_length():
-    lengths = [5, 3, 5, *[7] * 19]
-    groups = clips_by_length(lengths)
-    assert [(length, len(clips)) for length, clips in groups] == [(3, 1), (5, 2), (7, 16), (7, 3)]
-    assert sorted(clip for _, clips in groups for clip in clips.tolist()) == list(range(22))
-    assert all(lengths[clip] == length for length, clips in groups for clip in clips.tolist())

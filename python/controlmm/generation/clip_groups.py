@@ -16,21 +16,8 @@ from torch import Tensor
 
 Lengths = tuple[int, ...]  # of clips that lie end to end
 
-_TOGETHER = 16  # of 196 frames: what a layer makes of them stays in a processor's caches
-_TOKENS = 784  # of as many
+_TOKENS = 784  # of 16 clips of 196 frames: what a layer makes of them stays in a processor's caches
 _GROUP = 96  # tokens that take as long as what a group costs however small it is
-
-
-def clips_by_length(lengths: Sequence[int]) -> list[tuple[int, Int[Tensor, "N"]]]:
-    """(length, clips) of up to sixteen clips each; every clip is in one of the groups."""
-    rows: dict[int, list[int]] = {}
-    for clip, length in enumerate(lengths):
-        rows.setdefault(length, []).append(clip)
-    return [
-        (length, torch.tensor(clips[first : first + _TOGETHER]))
-        for length, clips in sorted(rows.items())
-        for first in range(0, len(clips), _TOGETHER)
-    ]
 
 
 def clips_of_like_length(lengths: Sequence[int]) -> list[Int[Tensor, "N"]]:

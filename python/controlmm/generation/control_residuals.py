@@ -211,7 +211,7 @@ class ClipView:
 
     @classmethod
     def of(cls, mask: Bool[Tensor, "T J 3"], led: Sequence[int], std: Float[Tensor, "C"]) -> ClipView:
-        """Of a clip's own frames, for a metric that knows joints that are ``led``; ``std`` is of all channels."""
+        """Of a clip's own frames; a metric knows joints that are ``led``, ``std`` is that of all channels."""
         own = controlled_joints(mask[None])
         channels = torch.tensor(_channels_of(own))
         return cls(

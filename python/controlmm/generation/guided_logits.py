@@ -77,8 +77,10 @@ def guided(
         if scale == 1:
             logits = predict(rows, valid, text)
         else:
-            both = predict(rows.repeat(2), valid.repeat(2, 1), torch.cat([text, torch.zeros_like(text)]))
-            with_text, without = both.chunk(2)
+            # A clip beside itself: attention takes neighbours of one length together.
+            texts = torch.stack([text, torch.zeros_like(text)], dim=1).flatten(0, 1)
+            both = predict(rows.repeat_interleave(2), valid.repeat_interleave(2, dim=0), texts)
+            with_text, without = both.unflatten(0, (-1, 2)).unbind(1)
             logits = without + scale * (with_text - without)
         if whole is None:
             whole = logits.new_zeros(*request.valid.shape, logits.shape[-1])

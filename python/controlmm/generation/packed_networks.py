@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import threading
 from collections.abc import Sequence
+from itertools import groupby
 from typing import TypeVar, cast
 from weakref import WeakKeyDictionary
 
@@ -18,7 +19,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.functional import layer_norm, pad, scaled_dot_product_attention
 
-from controlmm.generation.clip_groups import clips_by_length
 from controlmm.generation.frozen_matrix import Activation, FrozenMatrix
 
 _HEAD = "head"  # makes the logits, whose differences count: float32 always
@@ -159,13 +159,12 @@ class PackedEncoderLayer(nn.Module):
 
     def _attended(self, rows: Float[Tensor, "N 3W"], lengths: Sequence[int]) -> Float[Tensor, "N W"]:
         """Each clip attends to itself; ``rows`` are those of all clips without their padding."""
-        if len(set(lengths)) == 1:
-            return self._attended_alike(rows, lengths[0])
-        starts = torch.tensor([0, *lengths]).cumsum(0)
         attended = rows.new_empty(len(rows), rows.shape[1] // 3)
-        for length, clips in clips_by_length(lengths):
-            places = (starts[clips, None] + torch.arange(length)).flatten()
-            attended[places] = self._attended_alike(rows[places], length)
+        first = 0
+        for length, alike in groupby(lengths):
+            last = first + length * len(list(alike))
+            attended[first:last] = self._attended_alike(rows[first:last], length)
+            first = last
         return attended
 
     def _attended_alike(self, rows: Float[Tensor, "N 3W"], length: int) -> Float[Tensor, "N W"]:
