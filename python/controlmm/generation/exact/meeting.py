@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -65,17 +66,27 @@ def meet_exactly(
     joints = recover_joints(features[None].double(), joints=skeleton.num_joints)[0]
     targets = targets.double()
     lengths = _lengths(joints, skeleton) if bones is None else bones.double()
-    if _residual(joints, targets, mask) <= _NOTHING and _bone_error(joints, lengths, skeleton) <= _NOTHING:
-        return features, _report((joints, joints), targets, mask, features, lengths, skeleton)
+    planted = planted_feet(features, joints, skeleton)  # after as before
+
+    def measured(clip: Tensor) -> _Measures:
+        return _Measures(
+            _residual(clip, targets, mask),
+            _bone_error(clip, lengths, skeleton),
+            _jerk(clip, skeleton),
+            _slide(clip, planted, skeleton),
+        )
+
+    before = measured(joints)
+    if before.residual <= _NOTHING and before.bone_error <= _NOTHING:
+        return features, _report(before, before, skeleton)
     held = mask.clone()
     held[0, 0, [0, 2]] = True  # features begin with the root at x = z = 0
     wanted = torch.where(mask, targets, joints)
-    planted = planted_feet(features, joints, skeleton)
     moved = project_on_targets(joints, wanted, held, planted, skeleton)
     moved = restore_bones(moved, lengths, held, planted, skeleton)
     fitted = refit_features(features, moved, skeleton)
     after = recover_joints(fitted[None], joints=skeleton.num_joints)[0].double()
-    return fitted, _report((joints, after), targets, mask, features, lengths, skeleton)
+    return fitted, _report(before, measured(after), skeleton)
 
 
 def all_meet_exactly(
@@ -92,27 +103,18 @@ def all_meet_exactly(
     return side_by_side([partial(meet, clip) for clip in range(len(clips))])
 
 
-def _report(
-    clips: tuple[Tensor, Tensor],
-    targets: Tensor,
-    mask: Tensor,
-    features: Tensor,
-    lengths: Tensor,
-    skeleton: Skeleton,
-) -> ExactReport:
-    """Joints before and after, measured; feet are planted as they were before."""
-    planted = planted_feet(features, clips[0], skeleton)
+class _Measures(NamedTuple):
+    """Of one motion, in the skeleton's unit; see :class:`ExactReport`."""
 
-    def both(measure: Callable[[Tensor], float]) -> tuple[float, float]:
-        before, after = (measure(clip) * skeleton.metres for clip in clips)
-        return before, after
+    residual: float
+    bone_error: float
+    jerk: float
+    slide: float
 
-    return ExactReport(
-        residual=both(lambda clip: _residual(clip, targets, mask)),
-        bone_error=both(lambda clip: _bone_error(clip, lengths, skeleton)),
-        jerk=both(lambda clip: _jerk(clip, skeleton)),
-        slide=both(lambda clip: _slide(clip, planted, skeleton)),
-    )
+
+def _report(before: _Measures, after: _Measures, skeleton: Skeleton) -> ExactReport:
+    metres = skeleton.metres
+    return ExactReport(*((metres * one, metres * other) for one, other in zip(before, after, strict=True)))
 
 
 def planted_feet(

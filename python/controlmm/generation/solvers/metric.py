@@ -31,10 +31,16 @@ class Metric:
         diagonal = matrix.diagonal()
         diagonal += damping * diagonal.mean()
         self._inverse = torch.cholesky_inverse(torch.linalg.cholesky(matrix))
+        self._latest: tuple[Tensor, tuple[float, Tensor]] | None = None
         self._rest = 0.0 if groups is None else self._inverse.diagonal().mean().item()
 
     def weigh(self, residual: Float[Tensor, "N"]) -> tuple[float, Float[Tensor, "N"]]:
-        """``r^T M r / 2`` and ``M r``."""
+        """``r^T M r / 2`` and ``M r``; both are asked for again as long as no target is shifted."""
+        if self._latest is None or self._latest[0] is not residual:
+            self._latest = residual, self._weighed(residual)
+        return self._latest[1]
+
+    def _weighed(self, residual: Float[Tensor, "N"]) -> tuple[float, Float[Tensor, "N"]]:
         groups = self._groups
         reduced = residual if groups is None else groups.sum(residual)
         weights = self._inverse @ reduced
