@@ -105,30 +105,22 @@ def neighbours(x: Float[Tensor, "B T C"], distance: int, lengths: Lengths = ()) 
     The thread's next call writes over the result. For ``lengths`` see :class:`FrozenConv`.
     """
     batch, frames, channels = x.shape
-    rows = _SCRATCH.empty((batch, frames, 3 * channels), x.dtype)
-    reach = min(distance, frames)
-    rows[:, :reach, :channels] = 0
-    rows[:, reach:, :channels] = x[:, : frames - reach]
-    rows[..., channels : 2 * channels] = x
-    rows[:, : frames - reach, 2 * channels :] = x[:, reach:]
-    rows[:, frames - reach :, 2 * channels :] = 0
-    if len(lengths) > 1:
-        first, last = _ends(lengths, distance)
-        rows[0, :, :channels].index_fill_(0, first, 0)
-        rows[0, :, 2 * channels :].index_fill_(0, last, 0)
-    return rows
+    shown, beyond = _shown(lengths or (frames,) * batch, distance)
+    rows = _SCRATCH.empty((len(shown), channels), x.dtype)
+    torch.index_select(x.flatten(0, 1), 0, shown, out=rows)
+    rows.index_fill_(0, beyond, 0)
+    return rows.view(batch, frames, 3 * channels)
 
 
 @lru_cache(maxsize=256)
-def _ends(lengths: Lengths, distance: int) -> tuple[Int[Tensor, "N"], Int[Tensor, "M"]]:
-    """The first and the last ``distance`` frames of clips that lie end to end."""
-    first, last, start = [], [], 0
-    for length in lengths:
-        end, reach = start + length, min(distance, length)
-        first.append(torch.arange(start, start + reach))
-        last.append(torch.arange(end - reach, end))
-        start = end
-    return torch.cat(first), torch.cat(last)
+def _shown(lengths: Lengths, distance: int) -> tuple[Int[Tensor, "3N"], Int[Tensor, "M"]]:
+    """What is before, at and after each frame of clips end to end, and which of it is beyond the clip."""
+    counts = torch.tensor(lengths)
+    first = (counts.cumsum(0) - counts).repeat_interleave(counts)[:, None]
+    last = first + counts.repeat_interleave(counts)[:, None] - 1
+    wanted = torch.arange(len(first))[:, None] + torch.tensor([-distance, 0, distance])
+    shown = wanted.clamp(first, last)
+    return shown.flatten(), (shown != wanted).flatten().nonzero()[:, 0]
 
 
 class _Scratch(threading.local):
