@@ -59,7 +59,17 @@ def exact(frames: int) -> list[Workload]:
             parents=parents, feet=feet, enough=ENOUGH, steps=FRAME_STEPS, backend=backend,
         )  # fmt: skip
 
+    rotations = torch.randn(frames, 21, 6, generator=generator, dtype=torch.float64)
+    heading = torch.randn(frames, 4, generator=generator, dtype=torch.float64)
+
+    def swing(backend: ops.Backend) -> Callable[[], object]:
+        return lambda: ops.swing_rotations(
+            rotations, joints, noisy, heading, chains=HUMANML3D.chains, backend=backend
+        )
+
+    forms = {
+        "project_change": project, "smooth_bones": smooth, "frame_bones": single, "swing_rotations": swing,
+    }  # fmt: skip
     return [
-        Workload(name, {"public": form("native"), "twin": form("reference")})
-        for name, form in (("project_change", project), ("smooth_bones", smooth), ("frame_bones", single))
+        Workload(name, {"public": form("native"), "twin": form("reference")}) for name, form in forms.items()
     ]

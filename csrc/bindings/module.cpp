@@ -140,6 +140,12 @@ void register_kernels(Module& m) {
       },
       Unlocked());
   m.def(
+      "swing_rotations",
+      [](Arg parents, Arg starts, Arg before, Arg after, Arg heading, Arg rotations) {
+        swing_rotations(parents.view(), starts.view(), before.view(), after.view(), heading.view(), rotations.view());
+      },
+      Unlocked());
+  m.def(
       "winograd_parts", [](Arg x, Arg rows, Arg parts) { winograd_parts(x.view(), rows.view(), parts.view()); },
       Unlocked());
   m.def(

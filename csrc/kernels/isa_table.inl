@@ -40,6 +40,7 @@ namespace {
 #include "projection.inl"
 #include "smooth_bones.inl"
 #include "frame_bones.inl"
+#include "swing.inl"
 #include "winograd.inl"
 // clang-format on
 
@@ -53,8 +54,10 @@ constexpr Kernels<T> kernels() {
 }  // namespace
 
 extern const KernelTable table;
-const KernelTable table = {
-    CONTROLMM_TEXT(CONTROLMM_ISA), kernels<float>(), kernels<double>(), {&project, &smooth_bones, &frame_bones}};
+const KernelTable table = {CONTROLMM_TEXT(CONTROLMM_ISA),
+                           kernels<float>(),
+                           kernels<double>(),
+                           {&project, &smooth_bones, &frame_bones, &swing_rotations}};
 
 }  // namespace CONTROLMM_ISA
 }  // namespace controlmm

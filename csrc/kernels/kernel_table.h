@@ -159,6 +159,13 @@ struct FrameBonesArgs {
   double* joints;  // moved in place
 };
 
+struct SwingArgs {
+  BodyTree body;
+  const std::uint8_t* starts;
+  const double *before, *after, *heading;
+  double* rotations;  // row-major [frames, joints - 1, 6], turned in place
+};
+
 /// Half-open range of clips; a clip is never split between threads, so sums keep their order.
 struct ClipRange {
   std::int64_t begin, end;
@@ -183,6 +190,7 @@ struct ExactKernels {
   void (*project)(const ProjectionArgs&, double* scratch);
   void (*smooth_bones)(const SmoothBonesArgs&, double* scratch);
   void (*frame_bones)(const FrameBonesArgs&, double* scratch);
+  void (*swing_rotations)(const SwingArgs&, double* scratch);
 };
 
 struct KernelTable {
@@ -240,6 +248,12 @@ static constexpr std::int64_t frame_bones_scratch(std::int64_t joints) {
   return banded_scratch(joints, joints - 1) + 3 * joints * (joints + banded_stride(joints - 1)) + 4 * joints +
          clip_system_scratch(joints, joints - 1) + 3 * joints;
 }
+
+/// Numbers of a rotation matrix.
+constexpr std::int64_t kRotationRows = 9;
+
+/// Doubles of scratch memory for local rotations: those of all bones in sixteen frames, before and after.
+static constexpr std::int64_t swing_scratch(std::int64_t joints) { return 2 * joints * kRotationRows * kLanes; }
 
 const KernelTable& active_kernels();
 

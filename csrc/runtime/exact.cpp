@@ -9,7 +9,6 @@ using Flags = const std::uint8_t*;
 
 BodyTree body_tree(const TensorView& parents, const TensorView& joints, const char* name) {
   checks::require(joints, name, 3, DType::float64);
-  checks::require_row_major(joints, name);
   checks::require(parents, "parents", 1, DType::int64);
   checks::require_contiguous(parents, "parents");
   const BodyTree body{joints.shape[0], joints.shape[1], parents.as<const std::int64_t>()};
@@ -23,6 +22,13 @@ BodyTree body_tree(const TensorView& parents, const TensorView& joints, const ch
           "got " +
           std::to_string(body.parents[j]) + " for joint " + std::to_string(j) + ".");
   }
+  return body;
+}
+
+// Of joints that a kernel moves.
+BodyTree moved_body(const TensorView& parents, const TensorView& joints, const char* name) {
+  const BodyTree body = body_tree(parents, joints, name);
+  checks::require_row_major(joints, name);
   return body;
 }
 
@@ -48,7 +54,7 @@ std::unique_ptr<double[]> scratch(std::int64_t doubles) {
 
 void project_change(const TensorView& parents, const TensorView& held, const TensorView& planted, double stiffness,
                     double smoothness, double standing, const TensorView& change) {
-  const BodyTree body = body_tree(parents, change, "change");
+  const BodyTree body = moved_body(parents, change, "change");
   const ProjectionArgs args{body,
                             flags(held, "held", {body.frames, body.joints, 3}),
                             flags(planted, "planted", {body.frames, body.joints}),
@@ -64,7 +70,7 @@ void project_change(const TensorView& parents, const TensorView& held, const Ten
 void smooth_bones(const TensorView& parents, const TensorView& start, const TensorView& lengths, const TensorView& held,
                   const TensorView& planted, const TensorView& feet, const TensorView& toes, const PoseWeights& weights,
                   double enough, std::int64_t steps, const TensorView& joints) {
-  const BodyTree body = body_tree(parents, joints, "joints");
+  const BodyTree body = moved_body(parents, joints, "joints");
   const SmoothBonesArgs args{body,
                              numbers(start, "start", {body.frames, body.joints, 3}),
                              numbers(lengths, "lengths", {body.joints}),
@@ -90,7 +96,7 @@ void smooth_bones(const TensorView& parents, const TensorView& start, const Tens
 void frame_bones(const TensorView& parents, const TensorView& lengths, const TensorView& held,
                  const TensorView& planted, const TensorView& feet, const PoseWeights& weights, double slack,
                  double enough, double longest, std::int64_t steps, const TensorView& joints) {
-  const BodyTree body = body_tree(parents, joints, "joints");
+  const BodyTree body = moved_body(parents, joints, "joints");
   const FrameBonesArgs args{body,
                             numbers(lengths, "lengths", {body.joints}),
                             flags(held, "held", {body.frames, body.joints, 3}),
@@ -107,6 +113,23 @@ void frame_bones(const TensorView& parents, const TensorView& lengths, const Ten
   if (joints.size() == 0 || body.joints < 2) return;
   const auto memory = scratch(frame_bones_scratch(body.joints));
   active_kernels().exact.frame_bones(args, memory.get());
+}
+
+void swing_rotations(const TensorView& parents, const TensorView& starts, const TensorView& before,
+                     const TensorView& after, const TensorView& heading, const TensorView& rotations) {
+  const BodyTree body = body_tree(parents, before, "before");
+  checks::require(rotations, "rotations", 3, DType::float64);
+  checks::require_shape(rotations, "rotations", {body.frames, body.joints - 1, 6});
+  checks::require_row_major(rotations, "rotations");
+  const SwingArgs args{body,
+                       flags(starts, "starts", {body.joints}),
+                       numbers(before, "before", {body.frames, body.joints, 3}),
+                       numbers(after, "after", {body.frames, body.joints, 3}),
+                       numbers(heading, "heading", {body.frames, 4}),
+                       rotations.as<double>()};
+  if (rotations.size() == 0) return;
+  const auto memory = scratch(swing_scratch(body.joints));
+  active_kernels().exact.swing_rotations(args, memory.get());
 }
 
 }  // namespace controlmm

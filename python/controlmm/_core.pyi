@@ -153,6 +153,15 @@ def frame_bones(
     joints: _Array,
     /,
 ) -> None: ...
+def swing_rotations(
+    parents: _Array,
+    starts: _Array,
+    before: _Array,
+    after: _Array,
+    heading: _Array,
+    rotations: _Array,
+    /,
+) -> None: ...
 def winograd_parts(x: _Array, rows: _Array, parts: _Array, /) -> None: ...
 def winograd_frames(
     products: _Array, rows: _Array, bias: _Array, is_rectified: bool, y: _Array, /

@@ -120,6 +120,40 @@ void whole_bones_are_left_alone() {
   CHECK(clip.joints == before);
 }
 
+// A column of two bones without local rotations, the lower of which falls to the side while the upper stays upright.
+struct Column {
+  std::int64_t parents[3] = {-1, 0, 1};
+  bool starts[3] = {true, true, false};
+  double before[1][3][3] = {{{0, 0, 0}, {0, 1, 0}, {0, 2, 0}}}, after[1][3][3] = {{{0, 0, 0}, {1, 0, 0}, {1, 1, 0}}};
+  double heading[1][4] = {{3, 0, 0, 0}}, rotations[1][2][6] = {{{1, 0, 0, 0, 1, 0}, {1, 0, 0, 0, 1, 0}}};
+
+  void swing(std::int64_t joints = 3, std::int64_t bones = 2) {
+    controlmm::swing_rotations(row_major(parents, {joints}), row_major(starts, {joints}),
+                               row_major(&before[0][0][0], {1, joints, 3}), row_major(&after[0][0][0], {1, 3, 3}),
+                               row_major(&heading[0][0], {1, 4}), row_major(&rotations[0][0][0], {1, bones, 6}));
+  }
+  bool has(const double (&expected)[2][6]) const {
+    for (int b = 0; b < 2; ++b)
+      for (int i = 0; i < 6; ++i)
+        if (!is_close(rotations[0][b][i], expected[b][i], 1e-15)) return false;
+    return true;
+  }
+};
+
+void rotations_follow_their_bones() {
+  Column column, apart;
+  column.swing();
+  CHECK(column.has({{0, -1, 0, 1, 0, 0}, {0, 1, 0, -1, 0, 0}}));  // a quarter turn about z, and back
+  apart.starts[2] = true;
+  apart.swing();
+  CHECK(apart.has({{0, -1, 0, 1, 0, 0}, {1, 0, 0, 0, 1, 0}}));
+  Column flat;
+  flat.after[0][2][0] = 1;
+  flat.after[0][2][1] = 0;  // the upper bone has no length
+  flat.swing();
+  CHECK(flat.rotations[0][0][1] == -1 && std::isnan(flat.rotations[0][1][0]));
+}
+
 void what_does_not_fit_is_refused() {
   Clip clip;
   clip.parents[2] = 2;
@@ -132,6 +166,8 @@ void what_does_not_fit_is_refused() {
   clip.parents[0] = 0;
   CHECK(has(refusal([&] { clip.restore(); }), "got 0 for joint 0"));
   CHECK(has(refusal([&] { Clip().restore(3); }), "`parents`"));
+  CHECK(has(refusal([&] { Column().swing(3, 3); }), "`rotations`"));
+  CHECK(has(refusal([&] { Column().swing(2, 1); }), "`after`"));
 }
 
 }  // namespace
@@ -143,6 +179,7 @@ int main() {
     wanted_changes_are_met_and_others_never_read();
     bones_get_their_lengths_and_held_coordinates_stay();
     whole_bones_are_left_alone();
+    rotations_follow_their_bones();
     what_does_not_fit_is_refused();
   }
 }

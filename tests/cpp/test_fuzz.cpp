@@ -187,6 +187,10 @@ void fuzz_exact() {
   const auto frame = row_major_block<double>({frames, joints, 3});
   controlmm::frame_bones(parents.view, lengths.view, held.view, planted.view, feet.view, weights, 1e-9, 1e-3, 0.05,
                          steps, frame.view);
+  const auto starts = row_major_block<bool>({joints});
+  const auto heading = row_major_block<double>({frames, 4}),
+             rotations = row_major_block<double>({frames, joints - 1, 6});
+  controlmm::swing_rotations(parents.view, starts.view, start.view, change.view, heading.view, rotations.view);
 }
 
 template <class T>

@@ -163,6 +163,14 @@ void frame_bones(const TensorView& parents, const TensorView& lengths, const Ten
                  const TensorView& planted, const TensorView& feet, const PoseWeights& weights, double slack,
                  double enough, double longest, std::int64_t steps, const TensorView& joints);
 
+/// Local rotations whose bones swing from `before` to `after`, each frame for itself; see `swing_rotations`.
+/// @param starts    Boolean [joints]: whose rotation is relative to the heading instead of the parent's.
+/// @param before, after Row-major [frames, joints, 3].
+/// @param heading   Row-major [frames, 4], quaternions (w, x, y, z) of any length.
+/// @param rotations Row-major [frames, joints - 1, 6]: in, those of the bones before; out, after.
+void swing_rotations(const TensorView& parents, const TensorView& starts, const TensorView& before,
+                     const TensorView& after, const TensorView& heading, const TensorView& rotations);
+
 /// A convolution over time of width 3 by Winograd's F(4, 3), but for its products: what they take, see
 /// `winograd_parts`.
 /// @param x     Row-major [frames, channels].

@@ -27,6 +27,7 @@ from controlmm.ops.obstacles import (
     pack_obstacles,
 )
 from controlmm.ops.signed_distance import signed_distances
+from controlmm.ops.swing import swing_rotations
 from controlmm.ops.winograd import winograd_frames, winograd_parts, winograd_weights
 from controlmm.ops.winograd_tiles import WinogradTiles
 
@@ -57,6 +58,7 @@ __all__ = [
     "recover_joints",
     "signed_distances",
     "smooth_bones",
+    "swing_rotations",
     "use_backend",
     "use_isa",
     "winograd_frames",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from numbers import Integral
 
 import torch
@@ -41,6 +42,56 @@ def check_lengths(lengths: Tensor, parents: Sequence[int]) -> None:
     _check_float64("lengths", lengths)
     if lengths.shape != (len(parents),):
         raise ValueError(f"`lengths` must have shape ({len(parents)},), got {tuple(lengths.shape)}.")
+
+
+def check_swing(rotations: Tensor, before: Tensor, after: Tensor, heading: Tensor) -> None:
+    """Raises TypeError or ValueError unless the rotations, joints and headings are of one clip."""
+    named = {"rotations": rotations, "before": before, "after": after, "heading": heading}
+    for name, tensor in named.items():
+        _check_float64(name, tensor)
+    if before.ndim != 3 or before.shape[1] < 1 or before.shape[2] != 3:
+        raise ValueError(f"`before` must have shape (T, J, 3) with J >= 1, got {tuple(before.shape)}.")
+    frames, joints = before.shape[:2]
+    shapes = {"rotations": (frames, joints - 1, 6), "after": (frames, joints, 3), "heading": (frames, 4)}
+    for name, shape in shapes.items():
+        if named[name].shape != shape:
+            raise ValueError(
+                f"`{name}` must have shape {shape} to fit `before`, got {tuple(named[name].shape)}."
+            )
+
+
+def chain_bones(chains: Sequence[Sequence[int]], joints: int) -> tuple[list[int], list[bool]]:
+    """Of every joint, the one before it in its chain (-1 for joint 0), and whether that one starts the chain.
+
+    Raises TypeError or ValueError unless the chains lead to each joint but the first once, always onwards.
+    """
+    parents, starts = [-1] * joints, [True] * joints
+    for chain in chains:
+        _check_chain(chain, joints)
+        for place, (parent, joint) in enumerate(pairwise(chain)):
+            if joint <= parent:
+                raise ValueError(
+                    f"`chains` must go from earlier joints to later ones, got {joint} after {parent}."
+                )
+            if parents[joint] >= 0:
+                raise ValueError(f"`chains` must lead to each joint once, got {joint} again.")
+            parents[joint], starts[joint] = int(parent), place == 0
+    missing = [joint for joint in range(1, joints) if parents[joint] < 0]
+    if missing:
+        raise ValueError(
+            f"`chains` must lead to each of {joints} joints but the first, got none to {missing}."
+        )
+    return parents, starts
+
+
+def _check_chain(chain: Sequence[int], joints: int) -> None:
+    if not isinstance(chain, Sequence):
+        raise TypeError(f"`chains` must be sequences of joints, got {chain!r} among them.")
+    for joint in chain:
+        if not isinstance(joint, Integral):
+            raise TypeError(f"`chains` must hold indices of joints, got {joint!r}.")
+        if not 0 <= joint < joints:
+            raise ValueError(f"`chains` must lie within [0, {joints}), got {joint}.")
 
 
 def check_effort(enough: float, steps: int) -> None:
