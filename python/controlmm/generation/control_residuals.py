@@ -88,10 +88,12 @@ class ControlResiduals:
         self.channels = tuple(_channels_of(led))
         self._average: dict[int, Tensor] = {}  # products of the decoder's rows, for so many tokens
         self.part = PartialDecoder(decoder, range(mask.shape[2]), frames)
-        self._views = [
-            ClipView.of(clip[:length], led, self.part.std)
-            for clip, length in zip(mask, frames.sum(1).tolist(), strict=True)
-        ]
+        self._look_at(
+            [
+                ClipView.of(clip[:length], led, self.part.std)
+                for clip, length in zip(mask, frames.sum(1).tolist(), strict=True)
+            ]
+        )
         self._held: Tensor | None = None
         if prefix is not None:
             self._held = self.part.decode(prefix).features[:, :prefix_frames]
@@ -100,10 +102,16 @@ class ControlResiduals:
         """The same for some of the clips; what is known of them stays so."""
         some = copy(self)
         some._targets, some.part = self._targets[clips], self.part.select(clips)
-        some._views = [self._views[clip] for clip in clips.tolist()]
+        some._look_at([self._views[clip] for clip in clips.tolist()])
         some._held = None if self._held is None else self._held[clips]
         some.naturalness = None if self.naturalness is None else self.naturalness.select(clips)
         return some
+
+    def _look_at(self, views: Sequence[ClipView]) -> None:
+        """``views`` are those of all clips; ``_places`` says where their coordinates are in flat joints."""
+        self._views, apart = views, self._targets[:1].numel()
+        places = [view.coordinates + clip * apart for clip, view in enumerate(views)]
+        self._places = torch.cat([torch.zeros(0, dtype=torch.int64), *places])
 
     @torch.enable_grad()
     def probe(self, latents: Float[Tensor, "B L C"]) -> list[Probe]:
@@ -122,18 +130,19 @@ class ControlResiduals:
             self._strains = self.naturalness.values(features, self._joints)
             strains = self._strains.tolist()
         joints, features = self._joints.detach(), features.detach()
-        difference, metres = joints - self._targets, self.decoder.normalizer.skeleton.metres
+        residuals = (joints - self._targets).flatten()[self._places].double().split(self.coordinates)
+        metres = self.decoder.normalizer.skeleton.metres
         return [
             Probe(
-                apart.flatten()[view.coordinates].double(),
+                residual,
                 own_features[: len(view.mask)],
                 own_joints[: len(view.mask)],
                 view,
                 metres,
                 strain,
             )
-            for apart, own_features, own_joints, view, strain in zip(
-                difference, features, joints, self._views, strains, strict=True
+            for residual, own_features, own_joints, view, strain in zip(
+                residuals, features, joints, self._views, strains, strict=True
             )
         ]
 
@@ -165,9 +174,12 @@ class ControlResiduals:
         Zero for clips without weights.
         """
         gradient = torch.zeros_like(self._joints)
-        for clip, wanted in enumerate(weights):
-            if wanted is not None:
-                gradient[clip].view(-1)[self._views[clip].coordinates] = wanted.float()
+        gradient.view(-1)[self._places] = torch.cat(
+            [
+                torch.zeros(count) if wanted is None else wanted.float()
+                for wanted, count in zip(weights, self.coordinates, strict=True)
+            ]
+        )
         outputs, slopes = [self._joints], [gradient]
         if self._strains is not None and any(strained):
             outputs.append(self._strains)
