@@ -38,6 +38,7 @@ namespace {
 #include "gumbel.inl"
 #include "banded.inl"
 #include "projection.inl"
+#include "clip_system.inl"
 #include "smooth_bones.inl"
 #include "frame_bones.inl"
 #include "swing.inl"

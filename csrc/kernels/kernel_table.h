@@ -243,6 +243,20 @@ static constexpr std::int64_t clip_system_scratch(std::int64_t unknowns, std::in
   return banded_scratch(unknowns, reach) + unknowns + banded_stride(reach);
 }
 
+/// Stretches of a clip that a system of its joints keeps abreast: doubles of the widest register.
+constexpr std::int64_t kAbreast = 8;
+
+/// Pairs of frames in such a stretch.
+static constexpr std::int64_t clip_frame_pairs(std::int64_t frames) {
+  return (frames + 2 * kAbreast - 1) / (2 * kAbreast);
+}
+
+/// Doubles of scratch memory for a system of a clip's joints. Of every frame: blocks, right side, ties, flags; of every
+/// other one: five vectors, one of them with a row more. And what aligns them.
+static constexpr std::int64_t clip_joints_scratch(std::int64_t frames, std::int64_t joints) {
+  return ((12 + 5) * clip_frame_pairs(frames) + 1) * 3 * joints * kAbreast + kAbreast;
+}
+
 /// Doubles of scratch memory for the bones of single frames: how joints yield, bones, a system of bones, a move.
 static constexpr std::int64_t frame_bones_scratch(std::int64_t joints) {
   return banded_scratch(joints, joints - 1) + 3 * joints * (joints + banded_stride(joints - 1)) + 4 * joints +

@@ -89,7 +89,7 @@ void smooth_bones(const TensorView& parents, const TensorView& start, const Tens
                              steps,
                              joints.as<double>()};
   if (joints.size() == 0) return;
-  const auto memory = scratch(clip_system_scratch(3 * body.frames * body.joints, 3 * body.joints));
+  const auto memory = scratch(clip_joints_scratch(body.frames, body.joints));
   active_kernels().exact.smooth_bones(args, memory.get());
 }
 

@@ -182,6 +182,29 @@ def test_the_same_bits_on_all_instruction_sets_and_threads(case, name):
         assert torch.equal(result, results[0])
 
 
+@pytest.mark.parametrize("joints", [2, 3, 8, 23])
+@pytest.mark.parametrize("frames", [1, 2, 15, 16, 17, 33, 113])
+def test_any_tree_and_any_number_of_frames(frames, joints):
+    """The kernel keeps eight stretches of pairs of frames abreast; the last ones may be short or empty."""
+    parents = (-1, *(7 * joint % 5 % joint for joint in range(1, joints)))
+    lengths = 0.05 + 0.3 * random(joints, seed=joints).sigmoid()
+    clip = 0.2 * random(1, joints, 3, seed=6) + 0.02 * random(frames, joints, 3, seed=frames)
+    held, planted = random(frames, joints, 3, seed=7) > 1.5, random(frames, joints, seed=8) > 0.5
+    results = []
+    for isa in (None, *ops.available_isas()):
+        with ops.use_isa(isa) if isa else contextlib.nullcontext():
+            results.append(
+                ops.smooth_bones(
+                    clip, lengths, held, planted, parents=parents, feet=(joints - 1,), toes=(joints // 2,),
+                    enough=1e-9, steps=3, backend="native" if isa else "reference",
+                )
+            )  # fmt: skip
+    torch.testing.assert_close(results[1], results[0], rtol=0, atol=1e-12)
+    assert torch.equal(results[1][held], clip[held])
+    for result in results[2:]:
+        assert torch.equal(result, results[1])
+
+
 @each_operator
 @both_backends
 def test_arguments_stay_and_no_gradient_flows(backend, name, monkeypatch):

@@ -91,8 +91,9 @@ def smooth_bones(
         d^T (10 L + 1) d + 10^3 |d|^2 (feet) + 100 |d_{t+1} - d_t|^2 + 10^5 (|bone| - length)^2
         + 10^4 |d_{t+1} - d_t|^2 (planted ankles) + 10^4 |x_{t+1} - x_t|^2 (planted toes)
 
-    by Gauss-Newton steps that are damped by ``3 10^3 |step|^2``. Frames meet only their neighbours, so that a
-    step is one sweep through the clip and one back.
+    by Gauss-Newton steps that are damped by ``3 10^3 |step|^2``. Frames meet only their neighbours: the twin
+    finds a step by one sweep through the clip and one back, the kernel by conjugate gradients between frames,
+    to fourteen digits.
 
     Args:
         joints: Positions, float64.
