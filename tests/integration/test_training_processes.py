@@ -30,16 +30,14 @@ def arguments(stage: str, data: Path, root: Path) -> list[str]:
     ]  # fmt: skip
 
 
-def in_two_processes(*command: str) -> None:
+def in_two_processes(*program: str) -> str:
     started = subprocess.run(
-        [
-            sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2",
-            "--module", controlmm.__name__, *command,
-        ],
+        [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", *program],
         env={**os.environ, "OMP_NUM_THREADS": "1"}, timeout=PATIENCE, capture_output=True, text=True,
         check=False,
     )  # fmt: skip
     assert started.returncode == 0, started.stderr
+    return started.stdout
 
 
 @pytest.mark.parametrize("stage", ["rvq", "masked"])
@@ -51,7 +49,7 @@ def test_two_processes_train_as_one_with_the_double_batch(
     if stage != "rvq":
         for root in (together, alone):
             command(*arguments("rvq", tiny_data_folder, root))
-    in_two_processes(*arguments(stage, tiny_data_folder, together))
+    in_two_processes("--module", controlmm.__name__, *arguments(stage, tiny_data_folder, together))
     command(*arguments(stage, tiny_data_folder, alone), "--shards", "2")
 
     for file in ("checkpoint.safetensors", "best/model.safetensors"):
@@ -66,6 +64,30 @@ def test_two_processes_train_as_one_with_the_double_batch(
     assert json.loads(start)["processes"] == 2
     settings = json.loads((together / stage / "run.json").read_text())["settings"]
     assert (settings["shards"], settings["batch_size"]) == (2, 3)
+
+
+LEAVES_ALONE = """
+import os
+import torch
+from controlmm.training.processes import joined_processes
+
+with joined_processes() as team:
+    weight = torch.nn.Parameter(torch.ones(2))
+    optimizer = torch.optim.AdamW([weight])  # imports what keeps groups as default arguments
+    weight.sum().backward()
+    optimizer.step()
+    team.sum_([weight.detach()])
+names = [open(f"/proc/self/task/{task}/comm").read().strip() for task in os.listdir("/proc/self/task")]
+print([name for name in names if "gloo" in name])
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="threads are listed on Linux only")
+def test_no_thread_of_the_group_outlives_it(tmp_path: Path) -> None:
+    """One that did has aborted a process while the interpreter ended."""
+    script = tmp_path / "leaves_alone.py"
+    script.write_text(LEAVES_ALONE, encoding="utf-8")
+    assert in_two_processes(str(script)).count("[]") == 2
 
 
 def test_each_process_takes_its_part_of_the_shards() -> None:

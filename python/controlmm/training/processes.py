@@ -6,6 +6,7 @@ shards. So what a run computes does not depend on how many processes compute it.
 
 from __future__ import annotations
 
+import importlib
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -107,6 +108,9 @@ def joined_processes() -> Iterator[Processes]:
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         yield Processes()
         return
+    # Imported later, as optimizers do, it would keep the group as a default argument. Threads of gloo that
+    # are still there when the interpreter ends can take the process down.
+    importlib.import_module("torch.distributed.nn")
     on_gpus = torch.cuda.is_available() and torch.cuda.device_count() >= int(
         os.environ.get("LOCAL_WORLD_SIZE", "1")
     )
