@@ -21,7 +21,7 @@ class ClipSystem {
   };
 
   /// @param held   Coordinates that stay, row-major [frames, joints, 3].
-  /// @param memory `clip_joints_scratch(frames, joints)` doubles.
+  /// @param memory `banded_system_scratch(frames, joints)` doubles.
   ClipSystem(const BodyTree& body, const std::uint8_t* held, double stiffness, double bone_weight, double* memory)
       : body_(body),
         stiffness_(stiffness),

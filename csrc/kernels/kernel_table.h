@@ -239,7 +239,7 @@ static constexpr std::int64_t banded_scratch(std::int64_t unknowns, std::int64_t
 }
 
 /// Doubles of scratch memory for a clip's banded system, entries up to `reach` apart, with its right side.
-static constexpr std::int64_t clip_system_scratch(std::int64_t unknowns, std::int64_t reach) {
+static constexpr std::int64_t banded_system_scratch(std::int64_t unknowns, std::int64_t reach) {
   return banded_scratch(unknowns, reach) + unknowns + banded_stride(reach);
 }
 
@@ -253,14 +253,14 @@ static constexpr std::int64_t clip_frame_pairs(std::int64_t frames) {
 
 /// Doubles of scratch memory for a system of a clip's joints. Of every frame: blocks, right side, ties, flags; of every
 /// other one: five vectors, one of them with a row more. And what aligns them.
-static constexpr std::int64_t clip_joints_scratch(std::int64_t frames, std::int64_t joints) {
+static constexpr std::int64_t clip_system_scratch(std::int64_t frames, std::int64_t joints) {
   return ((12 + 5) * clip_frame_pairs(frames) + 1) * 3 * joints * kAbreast + kAbreast;
 }
 
 /// Doubles of scratch memory for the bones of single frames: how joints yield, bones, a system of bones, a move.
 static constexpr std::int64_t frame_bones_scratch(std::int64_t joints) {
   return banded_scratch(joints, joints - 1) + 3 * joints * (joints + banded_stride(joints - 1)) + 4 * joints +
-         clip_system_scratch(joints, joints - 1) + 3 * joints;
+         banded_system_scratch(joints, joints - 1) + 3 * joints;
 }
 
 /// Numbers of a rotation matrix.

@@ -63,7 +63,7 @@ void project_change(const TensorView& parents, const TensorView& held, const Ten
                             standing,
                             change.as<double>()};
   if (change.size() == 0) return;
-  const auto memory = scratch(clip_system_scratch(body.frames * body.joints, 2 * body.joints));
+  const auto memory = scratch(banded_system_scratch(body.frames * body.joints, 2 * body.joints));
   active_kernels().exact.project(args, memory.get());
 }
 
@@ -89,7 +89,7 @@ void smooth_bones(const TensorView& parents, const TensorView& start, const Tens
                              steps,
                              joints.as<double>()};
   if (joints.size() == 0) return;
-  const auto memory = scratch(clip_joints_scratch(body.frames, body.joints));
+  const auto memory = scratch(clip_system_scratch(body.frames, body.joints));
   active_kernels().exact.smooth_bones(args, memory.get());
 }
 
